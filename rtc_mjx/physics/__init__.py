@@ -1,0 +1,19 @@
+"""Worlds written in MJCF, stepped by MuJoCo MJX and differentiated exactly, contacts included."""
+
+from rtc_mjx.physics.step import (
+    PhysicsState,
+    Surroundings,
+    check_inputs,
+    constraint_rows,
+    contact_problem,
+    rest_state,
+    rest_surroundings,
+    simulate,
+    step,
+)
+from rtc_mjx.physics.world import World, asset_names, assets, from_model, load
+
+__all__ = [
+    "PhysicsState", "Surroundings", "World", "asset_names", "assets", "check_inputs", "constraint_rows",
+    "contact_problem", "from_model", "load", "rest_state", "rest_surroundings", "simulate", "step",
+]  # fmt: skip

@@ -1,0 +1,251 @@
+"""Worlds: an MJCF file, loaded, checked and given names. The first stage of the data flow.
+
+`load` reads `assets/<name>.xml`, copies its car and its road user as often as asked for, refuses what the differentiable
+step does not cover (`check_supported`), and returns a `World`: the compiled model plus the few indices the step needs.
+"""
+
+import functools
+import hashlib
+import math
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+import jax
+import mujoco
+import numpy as np
+from jaxtyping import Float
+from mujoco import mjx
+
+from rtc_mjx.errors import UnsupportedWorldError, UsageError
+
+MAX_COPIES = 256
+RIDE_HEIGHT = 0.75  # m, the height at which vehicle bodies move; all motion is in the plane
+COLLIDABLE = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
+JOINTS = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A compiled world with the indices that the step reads.
+
+    Attributes:
+        name: what it was loaded as; error messages use it.
+        mj: the compiled MuJoCo model.
+        control_names: actuators that take a control, in control order; actuators of zero gain (tyres) take none.
+        control_ids: their actuator ids.
+        mocap_names: bodies whose pose is given from outside, in mocap order.
+        user_geoms: the id of each mocap body's collision capsule, or -1 where it has none.
+    """
+
+    name: str
+    mj: mujoco.MjModel
+    control_names: tuple[str, ...]
+    control_ids: tuple[int, ...]
+    mocap_names: tuple[str, ...]
+    user_geoms: tuple[int, ...]
+
+    @property
+    def timestep(self) -> float:
+        """Duration of one physics step in s."""
+        return float(self.mj.opt.timestep)
+
+    @functools.cached_property
+    def fingerprint(self) -> str:
+        """Hash of the compiled model: two worlds with the same fingerprint step alike."""
+        buffer = np.empty(mujoco.mj_sizeModel(self.mj), np.uint8)
+        mujoco.mj_saveModel(self.mj, None, buffer)
+        return hashlib.sha256(buffer.tobytes()).hexdigest()
+
+    def mjx_model(self) -> mjx.Model:
+        """The model on the device, in the precision that JAX is set to at the call."""
+        return _mjx_model(self, jax.config.jax_enable_x64)
+
+    def mjx_data(self) -> mjx.Data:
+        """A template `mjx.Data`; the step rebuilds everything but the state from it."""
+        return _mjx_data(self, jax.config.jax_enable_x64)
+
+    @property
+    def default_sizes(self) -> Float[np.ndarray, "users 2"]:
+        """Length and width in m of each mocap body as the asset gives them; NaN where it collides with nothing."""
+        return np.array([_vehicle_size(self.mj, geom) for geom in self.user_geoms]).reshape(-1, 2)
+
+    def joint(self, name: str) -> int:
+        """Index of a joint in qpos and in qvel (the same: every joint has one degree of freedom)."""
+        return int(self.mj.jnt_qposadr[_named(self, mujoco.mjtObj.mjOBJ_JOINT, name)])
+
+    def site(self, name: str) -> int:
+        """Id of a site."""
+        return _named(self, mujoco.mjtObj.mjOBJ_SITE, name)
+
+    def body(self, name: str) -> int:
+        """Id of a body."""
+        return _named(self, mujoco.mjtObj.mjOBJ_BODY, name)
+
+    def control(self, name: str) -> int:
+        """Index of an actuator in the control vector."""
+        if name not in self.control_names:
+            raise UsageError(f"world '{self.name}' has no control '{name}'; it has {', '.join(self.control_names)}")
+        return self.control_names.index(name)
+
+
+@functools.lru_cache(maxsize=32)
+def _mjx_model(world: World, x64: bool) -> mjx.Model:
+    del x64  # part of the key: the arrays carry a precision
+    with jax.ensure_compile_time_eval():
+        return mjx.put_model(world.mj, impl="jax")
+
+
+@functools.lru_cache(maxsize=32)
+def _mjx_data(world: World, x64: bool) -> mjx.Data:
+    del x64
+    with jax.ensure_compile_time_eval():
+        return mjx.make_data(world.mj, impl="jax")
+
+
+def assets() -> Path:
+    """The folder of MJCF files: beside the package in a checkout, inside it in an installed wheel."""
+    inside = Path(str(resources.files("rtc_mjx"))) / "assets"
+    return inside if inside.is_dir() else Path(__file__).resolve().parents[2] / "assets"
+
+
+def asset_names() -> tuple[str, ...]:
+    """Worlds that `load` accepts by name."""
+    return ("double_goal", "driving")
+
+
+def load(name: str | Path, *, cars: int | None = None, road_users: int | None = None) -> World:
+    """Loads a world by asset name ('double_goal', 'driving') or by the path of an MJCF file.
+
+    Args:
+        name: an asset's name or a path that ends in .xml.
+        cars: how many free cars the world has (worlds with a `car0/` only); the file's own number if None.
+        road_users: how many replayed road users it has (worlds with a `user0` only); the file's own number if None.
+
+    Raises:
+        UsageError: no such asset, or a number of copies it cannot have.
+        UnsupportedWorldError: the model is outside what the differentiable step covers.
+    """
+    path = Path(name) if str(name).endswith(".xml") else assets() / f"{name}.xml"
+    if not path.is_file():
+        raise UsageError(f"no world '{name}': {path} is not a file; named worlds are {', '.join(asset_names())}")
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        _copy_cars(spec, path, cars)
+        _copy_users(spec, path, road_users)
+        model = spec.compile()
+    except ValueError as error:
+        raise error if isinstance(error, UsageError) else UsageError(f"{path}: {' '.join(str(error).split())}") from error
+    return from_model(model, name=path.stem)
+
+
+def from_model(model: mujoco.MjModel, *, name: str = "model") -> World:
+    """Makes a `World` of a compiled model; raises `UnsupportedWorldError` where the step does not cover it."""
+    check_supported(model, name)
+    control_ids = tuple(int(i) for i in range(model.nu) if np.any(model.actuator_gainprm[i]))
+    mocap = sorted((int(model.body_mocapid[b]), b) for b in range(model.nbody) if model.body_mocapid[b] >= 0)
+    return World(
+        name=name,
+        mj=model,
+        control_names=tuple(model.actuator(i).name for i in control_ids),
+        control_ids=control_ids,
+        mocap_names=tuple(model.body(b).name for _, b in mocap),
+        user_geoms=tuple(_collision_geom(model, b) for _, b in mocap),
+    )
+
+
+def check_supported(model: mujoco.MjModel, name: str) -> None:
+    """Raises `UnsupportedWorldError`, naming every element outside what the exact derivative and the tests cover."""
+    bad = [
+        *(["cone: elliptic friction cones; pyramidal is covered"] if model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL else []),
+        *_integrator(model),
+        *_elements(model, mujoco.mjtObj.mjOBJ_JOINT, ~np.isin(model.jnt_type, JOINTS), "ball or free joint"),
+        *_elements(model, mujoco.mjtObj.mjOBJ_JOINT, model.dof_frictionloss[model.jnt_dofadr] > 0, "joint with friction loss"),
+        *_elements(model, mujoco.mjtObj.mjOBJ_JOINT, model.jnt_actfrclimited > 0, "joint with actuator force limit"),
+        *_elements(model, mujoco.mjtObj.mjOBJ_EQUALITY, np.ones(model.neq, bool), "equality constraint"),
+        *_elements(model, mujoco.mjtObj.mjOBJ_TENDON, np.ones(model.ntendon, bool), "tendon"),
+        *_elements(model, mujoco.mjtObj.mjOBJ_FLEX, np.ones(model.nflex, bool), "flex"),
+        *_elements(model, mujoco.mjtObj.mjOBJ_GEOM, _uncovered_geoms(model), "colliding geom that is neither sphere nor capsule"),
+        *_elements(model, mujoco.mjtObj.mjOBJ_ACTUATOR, _uncovered_actuators(model), "actuator with state or of a muscle, user or servo-to-site kind"),
+        *([f"fluid forces (density {model.opt.density}, viscosity {model.opt.viscosity})"] if model.opt.density or model.opt.viscosity else []),
+    ]
+    if bad:
+        raise UnsupportedWorldError(f"world '{name}' is outside what the differentiable step covers: {'; '.join(bad)}")
+
+
+def _integrator(model: mujoco.MjModel) -> list[str]:
+    names = {mujoco.mjtIntegrator.mjINT_EULER: "Euler", mujoco.mjtIntegrator.mjINT_IMPLICITFAST: "implicitfast"}
+    if model.opt.integrator in names:
+        return []
+    return [f"integrator {mujoco.mjtIntegrator(model.opt.integrator).name}; {' and '.join(names.values())} are covered"]
+
+
+def _elements(model: mujoco.MjModel, kind: mujoco.mjtObj, mask: np.ndarray, what: str) -> list[str]:
+    names = [mujoco.mj_id2name(model, kind, int(i)) or f"#{i}" for i in np.flatnonzero(mask)]
+    return [f"{what}: {', '.join(names)}"] if names else []
+
+
+def _uncovered_geoms(model: mujoco.MjModel) -> np.ndarray:
+    return ((model.geom_contype | model.geom_conaffinity) != 0) & ~np.isin(model.geom_type, COLLIDABLE)
+
+
+def _uncovered_actuators(model: mujoco.MjModel) -> np.ndarray:
+    gains = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE)
+    biases = (mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE)
+    site = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_SITE) & (model.actuator_trnid[:, 1] >= 0)
+    stateless = model.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE
+    return ~stateless | ~np.isin(model.actuator_gaintype, gains) | ~np.isin(model.actuator_biastype, biases) | site
+
+
+def _named(world: World, kind: mujoco.mjtObj, name: str) -> int:
+    found = mujoco.mj_name2id(world.mj, kind, name)
+    if found < 0:
+        label = mujoco.mju_type2Str(kind)
+        count = {"joint": world.mj.njnt, "site": world.mj.nsite, "body": world.mj.nbody}[label]
+        known = [mujoco.mj_id2name(world.mj, kind, i) or f"#{i}" for i in range(count)]
+        raise UsageError(f"world '{world.name}' has no {label} '{name}'; it has {', '.join(known)}")
+    return int(found)
+
+
+def _collision_geom(model: mujoco.MjModel, body: int) -> int:
+    first, count = int(model.body_geomadr[body]), int(model.body_geomnum[body])
+    found = [g for g in range(first, first + count) if model.geom_contype[g] | model.geom_conaffinity[g]]
+    if len(found) > 1 or any(model.geom_type[g] != mujoco.mjtGeom.mjGEOM_CAPSULE for g in found):
+        raise UnsupportedWorldError(f"mocap body '{model.body(body).name}' needs exactly one colliding geom, a capsule, or none")
+    return found[0] if found else -1
+
+
+def _vehicle_size(model: mujoco.MjModel, geom: int) -> tuple[float, float]:
+    radius, half = model.geom_size[geom][:2] if geom >= 0 else (math.nan, math.nan)
+    return 2 * float(radius + half), 2 * float(radius)
+
+
+def _copies(spec: mujoco.MjSpec, path: Path, option: str, wanted: int | None, first: str, minimum: int) -> range:
+    if wanted is None:
+        return range(0)
+    if spec.body(first) is None:
+        raise UsageError(f"{path}: {option}={wanted} given, but the world has no body '{first}' to copy")
+    if not minimum <= wanted <= MAX_COPIES:
+        raise UsageError(f"{option}={wanted} is not between {minimum} and {MAX_COPIES}")
+    return range(1, wanted)
+
+
+def _copy_cars(spec: mujoco.MjSpec, path: Path, cars: int | None) -> None:
+    for index in _copies(spec, path, "cars", cars, "car0/chassis", 1):
+        car = mujoco.MjSpec.from_file(str(path.parent / "car.xml"))
+        spec.attach(car, prefix=f"car{index}/", frame=spec.worldbody.add_frame(pos=[0, 0, RIDE_HEIGHT]))
+
+
+def _copy_users(spec: mujoco.MjSpec, path: Path, road_users: int | None) -> None:
+    copies = _copies(spec, path, "road_users", road_users, "user0", 0)
+    original = spec.body("user0")
+    for index in copies:
+        body = spec.worldbody.add_body(name=f"user{index}", mocap=True, pos=original.pos)
+        for geom in original.geoms:
+            body.add_geom(
+                name=geom.name.replace("user0", f"user{index}"), type=geom.type, size=geom.size, quat=geom.quat,
+                friction=geom.friction, rgba=geom.rgba, group=geom.group, material=geom.material,
+                contype=geom.contype, conaffinity=geom.conaffinity,
+            )  # fmt: skip
+    if road_users == 0:
+        spec.delete(original)

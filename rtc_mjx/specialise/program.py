@@ -1,0 +1,191 @@
+"""A traced and folded function as a value: `Program`, and `specialise`, which wraps one as a JAX function."""
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+
+from rtc_mjx.errors import UsageError
+from rtc_mjx.specialise import emit, interpret
+from rtc_mjx.specialise.derivative import adjoint
+from rtc_mjx.specialise.graph import Graph, Node
+
+Shape = tuple[tuple[int, ...], np.dtype]
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """Scalar arithmetic from flat inputs to flat outputs.
+
+    Attributes:
+        graph: where the nodes live; adjoints are added to it.
+        inputs: shape and type of each input array, in order; scalars are numbered through.
+        outputs: nodes of each output array.
+    """
+
+    graph: Graph
+    inputs: tuple[Shape, ...]
+    outputs: tuple[np.ndarray, ...]
+
+    @functools.cached_property
+    def input_nodes(self) -> list[Node]:
+        """One node per input scalar."""
+        dtypes = [dtype for shape, dtype in self.inputs for _ in range(int(np.prod(shape)))]
+        return [self.graph.input(i, dtype) for i, dtype in enumerate(dtypes)]
+
+    @functools.cached_property
+    def output_nodes(self) -> list[Node]:
+        """One node per output scalar."""
+        return [int(n) for array in self.outputs for n in array.flat]
+
+    @functools.cached_property
+    def saved(self) -> list[Node]:
+        """Nodes that the forward pass keeps for the backward pass."""
+        return [n for n in self.graph.live(self.output_nodes) if self.graph.ops[n] == "saved"]
+
+    @property
+    def operations(self) -> int:
+        """Number of scalar operations left after folding."""
+        return sum(self.graph.ops[n] not in ("const", "input") for n in self.graph.live(self.output_nodes))
+
+    @functools.lru_cache(maxsize=16)  # noqa: B019 programs are few and live as long as the process
+    def backward(self, wanted: tuple[bool, ...]) -> "Backward":
+        """The adjoint program with respect to the inputs marked as wanted."""
+        graph, nodes = self.graph, self.input_nodes
+        count = len(nodes)
+        floats = [np.issubdtype(graph.dtypes[n], np.inexact) for n in self.output_nodes]
+        seeds = [graph.input(count + i, graph.dtypes[n]) if f else None for i, (n, f) in enumerate(zip(self.output_nodes, floats, strict=True))]
+        ends = np.cumsum([int(np.prod(shape)) for shape, _ in self.inputs])
+        groups = np.split(np.array(nodes, np.int64), ends[:-1])
+        chosen = [int(n) for group, want in zip(groups, wanted, strict=True) if want for n in group]
+        return Backward([s for s in seeds if s is not None], adjoint(graph, self.output_nodes, seeds, chosen))
+
+    def __call__(self, *arrays: Any, mode: emit.Mode | None = None) -> list[jax.Array]:
+        """Evaluates the program; differentiable in reverse mode."""
+        return list(_call(self, mode or emit.default_mode())(*(jnp.asarray(a, d) for a, (_, d) in zip(arrays, self.inputs, strict=True))))
+
+
+@dataclass(frozen=True)
+class Backward:
+    """An adjoint program: cotangent inputs, and the cotangents of the wanted inputs."""
+
+    seeds: list[Node]
+    outputs: list[Node]
+
+
+def specialise(function: Callable[..., Any], *examples: Any, mode: emit.Mode | None = None) -> Callable[..., Any]:
+    """Returns the same function of one world, folded and scalarised for the shapes and types of the examples.
+
+    Args:
+        function: a JAX function of pytrees of arrays for one world; constants it closes over are folded in.
+        examples: arguments (arrays or ShapeDtypeStruct) that give structure, shapes and types; values are not used.
+        mode: 'kernel', 'vector', or None for what suits the device (`emit`).
+
+    Returns:
+        A function of the same arguments with the same values and reverse-mode derivatives, to float rounding; its attribute
+        `program` is the `Program`.
+    """
+    program, structure = trace(function, *examples)
+    return wrap(program, structure, jax.tree.structure(examples), mode)
+
+
+def trace(function: Callable[..., Any], *examples: Any) -> tuple[Program, Any]:
+    """Traces and folds; returns the program and the structure of the function's result."""
+    leaves = [jax.ShapeDtypeStruct(np.shape(x), jax.dtypes.canonicalize_dtype(x.dtype)) for x in jax.tree.leaves(examples)]
+    examples = jax.tree.unflatten(jax.tree.structure(examples), leaves)
+    jaxpr, shapes = jax.make_jaxpr(function, return_shape=True)(*examples)
+    graph, nodes, count = Graph(), [], 0
+    for leaf in leaves:
+        size = int(np.prod(leaf.shape))
+        scalars = [graph.input(count + i, leaf.dtype) for i in range(size)]
+        nodes.append(np.array(scalars, np.int64).reshape(leaf.shape))
+        count += size
+    outputs = interpret.trace_into(graph, jaxpr, nodes)
+    program = Program(graph, tuple((x.shape, np.dtype(x.dtype)) for x in leaves), tuple(outputs))
+    return program, jax.tree.structure(shapes)
+
+
+def wrap(program: Program, structure: Any, arguments: Any, mode: emit.Mode | None) -> Callable[..., Any]:
+    """The program as a function of pytrees."""
+
+    def specialised(*inputs: Any) -> Any:
+        if jax.tree.structure(inputs) != arguments:
+            raise UsageError(f"specialised for arguments {arguments}, called with {jax.tree.structure(inputs)}")
+        return jax.tree.unflatten(structure, program(*jax.tree.leaves(inputs), mode=mode))
+
+    specialised.program = program
+    return specialised
+
+
+@functools.lru_cache(maxsize=256)
+def _call(program: Program, mode: emit.Mode) -> Callable[..., tuple[jax.Array, ...]]:
+    """The program on flat arrays, with its own reverse-mode rule: residuals are its inputs and its saved nodes."""
+
+    def run(arrays: Sequence[jax.Array], extra: Sequence[Node]) -> tuple[tuple[jax.Array, ...], list[jax.Array]]:
+        given = dict(zip(program.input_nodes, _scalars(arrays), strict=True))
+        values = emit.evaluate(program.graph, given, [*program.output_nodes, *extra], mode)
+        count = len(program.output_nodes)
+        return _pack(program.graph, values[:count], program.outputs), values[count:]
+
+    @jax.custom_vjp
+    def call(*arrays: jax.Array) -> tuple[jax.Array, ...]:
+        return run(arrays, ())[0]
+
+    def forward(*primals: Any) -> Any:
+        arrays = [p.value for p in primals]
+        outputs, saved = run(arrays, program.saved)
+        return outputs, (_Wanted(tuple(bool(p.perturbed) for p in primals)), arrays, saved)
+
+    def backward(residuals: Any, cotangents: Sequence[Any]) -> tuple[Any, ...]:
+        mask, arrays, saved = residuals
+        adjoints = program.backward(mask.inputs)
+        seeds = [_zeros(c) for c, nodes in zip(cotangents, program.outputs, strict=True) if _is_float(program.graph, nodes)]
+        given = dict(zip(program.input_nodes, _scalars(arrays), strict=True))
+        given |= dict(zip(program.saved, saved, strict=True)) | dict(zip(adjoints.seeds, _scalars(seeds), strict=True))
+        values = iter(emit.evaluate(program.graph, given, adjoints.outputs, mode))
+        return tuple(
+            _stack([next(values) for _ in range(int(np.prod(shape)))], shape, dtype) if wanted else None
+            for wanted, (shape, dtype) in zip(mask.inputs, program.inputs, strict=True)
+        )
+
+    call.defvjp(forward, backward, symbolic_zeros=True)
+    return call
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class _Wanted:
+    """Which inputs a derivative is wanted for: static, so that the adjoint program leaves the others out."""
+
+    inputs: tuple[bool, ...]
+
+
+def _is_float(graph: Graph, nodes: np.ndarray) -> bool:
+    return nodes.size > 0 and np.issubdtype(graph.dtypes[int(nodes.flat[0])], np.inexact)
+
+
+def _zeros(cotangent: Any) -> jax.Array:
+    if isinstance(cotangent, SymbolicZero):
+        return jnp.zeros(cotangent.shape, cotangent.dtype)
+    return cotangent
+
+
+def _scalars(arrays: Sequence[Any]) -> list[Any]:
+    return [x for array in arrays for x in jnp.ravel(array)]
+
+
+def _stack(scalars: Sequence[Any], shape: tuple[int, ...], dtype: Any) -> jax.Array:
+    return jnp.stack([jnp.asarray(x, dtype) for x in scalars]).reshape(shape) if scalars else jnp.zeros(shape, dtype)
+
+
+def _pack(graph: Graph, values: Sequence[Any], outputs: Sequence[np.ndarray]) -> tuple[jax.Array, ...]:
+    ends = np.cumsum([0, *(a.size for a in outputs)])
+    return tuple(
+        _stack(values[a:b], nodes.shape, graph.dtypes[int(nodes.flat[0])] if nodes.size else np.float32)
+        for a, b, nodes in zip(ends[:-1], ends[1:], outputs, strict=True)
+    )
