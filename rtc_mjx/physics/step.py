@@ -198,8 +198,29 @@ def _forward(world: World, model: mjx.Model, state: PhysicsState, control: Array
     )
     if state.warmstart.size:
         data = data.replace(qacc_warmstart=state.warmstart)
-    data = mjx.fwd_velocity(model, mjx.fwd_position(model, data))
+    data = mjx.fwd_velocity(model, _fwd_position(world, model, data))
     return mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
+
+
+def _fwd_position(world: World, model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.fwd_position` without cameras and tendons, and with contact frames that suit a planar world."""
+    data = mjx.factor_m(model, mjx.crb(model, mjx.com_pos(model, mjx.kinematics(model, data))))
+    data = mjx.collision(model, data)
+    if world.planar and data._impl.ncon:
+        data = data.tree_replace({"_impl.contact.frame": _planar_frames(data._impl.contact.frame)})
+    return mjx.transmission(model, mjx.make_constraint(model, data))
+
+
+def _planar_frames(frames: Float[Array, "contacts 3 3"]) -> Float[Array, "contacts 3 3"]:
+    """Contact frames (normal, in-plane tangent, z).
+
+    MJX picks the tangents by the normal's direction; up to order and sign they are these, and with equal friction along
+    both the friction pyramid is the same set of rows. Fixed, the rows along z fold away when the step is specialised.
+    """
+    x, y = frames[:, 0, 0], frames[:, 0, 1]
+    zero, one = jnp.zeros_like(x), jnp.ones_like(x)
+    rows = ([x, y, zero], [-y, x, zero], [zero, zero, one])
+    return jnp.stack([jnp.stack(row, axis=1) for row in rows], axis=1)
 
 
 def _problem(data: mjx.Data, mass: Array) -> contact.ContactProblem:

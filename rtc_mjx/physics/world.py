@@ -57,6 +57,11 @@ class World:
         mujoco.mj_saveModel(self.mj, None, buffer)
         return hashlib.sha256(buffer.tobytes()).hexdigest()
 
+    @functools.cached_property
+    def planar(self) -> bool:
+        """Whether everything that can collide moves in one horizontal plane, with friction equal in all directions."""
+        return _is_planar(self.mj)
+
     def mjx_model(self) -> mjx.Model:
         """The model on the device, in the precision that JAX is set to at the call."""
         return _mjx_model(self, jax.config.jax_enable_x64)
@@ -195,6 +200,20 @@ def _uncovered_actuators(model: mujoco.MjModel) -> np.ndarray:
     site = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_SITE) & (model.actuator_trnid[:, 1] >= 0)
     stateless = model.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE
     return ~stateless | ~np.isin(model.actuator_gaintype, gains) | ~np.isin(model.actuator_biastype, biases) | site
+
+
+def _is_planar(model: mujoco.MjModel) -> bool:
+    axes = model.jnt_axis[:, 2]
+    flat = np.where(model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE, axes == 0, np.abs(axes) == 1)
+    colliding = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    upright = np.all(data.xmat.reshape(-1, 3, 3)[:, 2, 2] > 1 - 1e-12)
+    level = np.ptp(data.geom_xpos[colliding, 2]) < 1e-12 if colliding.size else True
+    lying = np.abs(data.geom_xmat.reshape(-1, 3, 3)[colliding, 2, 2]) < 1e-12  # a capsule's axis is its z
+    sphere = model.geom_type[colliding] == mujoco.mjtGeom.mjGEOM_SPHERE
+    one_friction = np.all(np.isin(model.geom_condim[colliding], (1, 3))) and model.npair == 0
+    return bool(np.all(flat) and upright and level and np.all(lying | sphere) and one_friction)
 
 
 def _named(world: World, kind: mujoco.mjtObj, name: str) -> int:

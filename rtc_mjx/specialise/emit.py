@@ -23,6 +23,7 @@ from rtc_mjx.specialise.graph import ELEMENTWISE, Graph, Node
 
 Mode = Literal["kernel", "vector"]
 KERNEL_NODES = 1000  # see the module docstring
+IDENTITY, RESULT = -1, 2  # tags, beside 0 and 1 of the two elements
 Values = dict[Node, Any]
 
 
@@ -131,13 +132,38 @@ def _run_kernel(graph: Graph, part: Sequence[Node], needed: Sequence[Node], valu
     def combine(left: Sequence[Any], right: Sequence[Any]) -> tuple[Any, ...]:
         inner = {n: x for n, x in zip(source, right[1:], strict=True) if n is not None}
         _run_scalars(graph, part, inner)
-        both = (left[0] > 0) & (right[0] > 0)
-        given = [lax.select(right[0] > 0, b, a) for a, b in zip(left[1:], right[1:], strict=True)]
+        both = (left[0] >= 0) & (right[0] >= 0)
+        given = [lax.select(right[0] >= 0, b, a) for a, b in zip(left[1:], right[1:], strict=True)]
         made = [g if n is None else lax.select(both, inner[n], g) for n, g in zip(target, given, strict=True)]
-        return (left[0] + right[0], *made)
+        return (lax.select(both, np.int32(RESULT), lax.max(left[0], right[0])), *made)
 
-    zeros = [np.zeros((), d) for d, _ in slots]
-    doubled = [jnp.broadcast_to(z if n is None else values[n], (2,)) for n, z in zip(source, zeros, strict=True)]
-    operands = lax.optimization_barrier((jnp.array([1, 2], np.int32), *doubled))  # keeps XLA from fusing into the kernel
-    results = lax.reduce(operands, (np.int32(0), *zeros), combine, (0,))
-    values.update({n: x for n, x in zip(target, results[1:], strict=True) if n is not None})
+    given = [np.zeros((), d) if n is None else values[n] for n, (d, _) in zip(source, slots, strict=True)]
+    results = _batched(combine)(*given)
+    values.update({n: x for n, x in zip(target, results, strict=True) if n is not None})
+
+
+def _batched(combine: Callable[[Sequence[Any], Sequence[Any]], tuple[Any, ...]]) -> Callable[..., tuple[jax.Array, ...]]:
+    """The reduction of the module docstring on scalars; vmap turns it into one reduction over the whole batch.
+
+    A pass that drops unused results of a reduction (StableHLO's target-independent optimisation) walks the body without
+    remembering where it has been, which is exponential in shared sub-expressions; it does not start if all are used.
+    """
+
+    def reduction(*arrays: Any) -> tuple[jax.Array, ...]:
+        shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in arrays))
+        tags = lax.broadcasted_iota(np.int32, (2, *shape), 0)  # not an array of constants: see the module docstring
+        doubled = [jnp.broadcast_to(x, (2, *shape)) for x in arrays]
+        zeros = [np.zeros((), x.dtype) for x in doubled]
+        operands = (tags, *doubled)
+        results = lax.reduce(operands, (np.int32(IDENTITY), *zeros), combine, (0,))
+        return tuple(lax.optimization_barrier(tuple(results))[1:])  # every result used: see the docstring
+
+    batched = jax.custom_batching.custom_vmap(reduction)
+
+    @batched.def_vmap
+    def over_batch(size: int, is_batched: Sequence[bool], *arrays: Any) -> tuple[Any, Any]:
+        full = [x if b else jnp.broadcast_to(x, (size, *jnp.shape(x))) for x, b in zip(arrays, is_batched, strict=True)]
+        results = batched(*full)
+        return results, (True,) * len(results)
+
+    return batched

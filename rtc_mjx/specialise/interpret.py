@@ -238,6 +238,7 @@ class _Interpreter:
         height, width = math.prod(x.shape[d] for d in free_x), math.prod(y.shape[d] for d in free_y)
         rows = np.transpose(x, [*batch_x, *free_x, *contract_x]).reshape([*batch, height, depth])
         columns = np.transpose(y, [*batch_y, *free_y, *contract_y]).reshape([*batch, width, depth])
+        rows, columns = (self.each(lambda n: self.graph.convert(n, dtype), part) for part in (rows, columns))
         out = np.empty([*rows.shape[:-1], columns.shape[-2]], np.int64)
         for place in np.ndindex(*out.shape):
             *group, i, j = place
