@@ -1,19 +1,18 @@
 """Worlds written in MJCF, stepped by MuJoCo MJX and differentiated exactly, contacts included."""
 
+from rtc_mjx.physics.rollout import check_inputs, simulate
 from rtc_mjx.physics.step import (
     PhysicsState,
     Surroundings,
-    check_inputs,
     constraint_rows,
     contact_problem,
     rest_state,
     rest_surroundings,
-    simulate,
     step,
 )
-from rtc_mjx.physics.world import World, asset_names, assets, from_model, load
+from rtc_mjx.physics.world import World, asset_names, assets, from_spec, load
 
 __all__ = [
     "PhysicsState", "Surroundings", "World", "asset_names", "assets", "check_inputs", "constraint_rows",
-    "contact_problem", "from_model", "load", "rest_state", "rest_surroundings", "simulate", "step",
+    "contact_problem", "from_spec", "load", "rest_state", "rest_surroundings", "simulate", "step",
 ]  # fmt: skip

@@ -25,30 +25,38 @@ LINE_SEARCH_ITERATIONS = 2
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class ContactProblem:
-    """What the solver sees; all rows are one-sided (contacts and joint limits)."""
+class Rows:
+    """One-sided constraint rows (contacts and joint limits): J, D and a of the module docstring."""
 
-    mass: Float[Array, "nv nv"]
-    force: Float[Array, "nv"]
     jacobian: Float[Array, "rows nv"]
     stiffness: Float[Array, "rows"]
     reference: Float[Array, "rows"]
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ContactProblem:
+    """What the solver sees: mass matrix (kg, kg m, kg m^2), smooth force (N, N m) and the constraint rows."""
+
+    mass: Float[Array, "nv nv"]
+    force: Float[Array, "nv"]
+    rows: Rows
+
+
 def violation(problem: ContactProblem, acceleration: Float[Array, "nv"]) -> Float[Array, "rows"]:
     """J q - a where negative, else 0: by how much each active row falls short of its reference acceleration."""
-    return jnp.minimum(problem.jacobian @ acceleration - problem.reference, 0)
+    return jnp.minimum(_excess(problem, acceleration), 0)
 
 
 def residual(problem: ContactProblem, acceleration: Float[Array, "nv"]) -> Float[Array, "nv"]:
     """r(q): the gradient of the contact cost, in N and N m; zero at the solution."""
-    forces = problem.stiffness * violation(problem, acceleration)
-    return problem.mass @ acceleration - problem.force + problem.jacobian.T @ forces
+    forces = problem.rows.stiffness * violation(problem, acceleration)
+    return problem.mass @ acceleration - problem.force + problem.rows.jacobian.T @ forces
 
 
 def relative_residual(problem: ContactProblem, acceleration: Float[Array, "nv"]) -> Float[Array, ""]:
     """Norm of the residual, in units of acceleration (M^-1 r), over 1 + the norm of the acceleration itself."""
-    change = _solve(problem.mass, residual(problem, acceleration))
+    change = solve(problem.mass, residual(problem, acceleration))
     return jnp.linalg.norm(change) / (1 + jnp.linalg.norm(acceleration))
 
 
@@ -63,8 +71,8 @@ def exact(problem: ContactProblem, solution: Float[Array, "nv"]) -> Float[Array,
         q* - H^-1 r(q*), where only r's own dependence on the problem is differentiated (module docstring).
     """
     solution = checkpoint_name(lax.stop_gradient(solution), SOLUTION)
-    hessian = lax.stop_gradient(_hessian(problem, solution))  # H is held fixed: r(q*) = 0, so its derivative drops out
-    return solution - _solve(hessian, residual(problem, solution))
+    hessian = lax.stop_gradient(_hessian(problem, _excess(problem, solution) < 0))  # H is held fixed: r(q*) = 0, so its derivative drops out
+    return solution - solve(hessian, residual(problem, solution))
 
 
 def newton(problem: ContactProblem, start: Float[Array, "nv"], iterations: int = NEWTON_ITERATIONS) -> Float[Array, "nv"]:
@@ -78,49 +86,55 @@ def newton(problem: ContactProblem, start: Float[Array, "nv"], iterations: int =
         start: where to begin, the unconstrained acceleration M^-1 f or the previous step's solution, rad/s^2 and m/s^2.
         iterations: number of Newton steps.
     """
-    acceleration = start
+    acceleration, excess = start, _excess(problem, start)
     for _ in range(iterations):
-        direction = -_solve(_hessian(problem, acceleration), residual(problem, acceleration))
-        acceleration = acceleration + _line_search(problem, acceleration, direction) * direction
+        force = problem.rows.stiffness * jnp.minimum(excess, 0)
+        gradient = problem.mass @ acceleration - problem.force + problem.rows.jacobian.T @ force
+        direction = -solve(_hessian(problem, excess < 0), gradient)
+        change = problem.rows.jacobian @ direction
+        length = _line_search(problem, direction, direction @ gradient, excess, change)
+        acceleration, excess = acceleration + length * direction, excess + length * change
     return acceleration
 
 
-def warm_start(problem: ContactProblem, previous: Float[Array, "nv"]) -> Float[Array, "nv"]:
-    """The cheaper of the previous step's acceleration and the unconstrained one, as MuJoCo starts its solvers."""
-    smooth = _solve(problem.mass, problem.force)
-    return jnp.where(_cost(problem, previous) < _cost(problem, smooth), previous, smooth)
+def _excess(problem: ContactProblem, acceleration: Float[Array, "nv"]) -> Float[Array, "rows"]:
+    return problem.rows.jacobian @ acceleration - problem.rows.reference
 
 
-def _cost(problem: ContactProblem, acceleration: Float[Array, "nv"]) -> Float[Array, ""]:
-    short = violation(problem, acceleration)
-    smooth = acceleration @ (0.5 * (problem.mass @ acceleration) - problem.force)
-    return smooth + 0.5 * jnp.sum(problem.stiffness * short * short)
+def _hessian(problem: ContactProblem, active: Float[Array, "rows"]) -> Float[Array, "nv nv"]:
+    weight = jnp.where(active, problem.rows.stiffness, 0)
+    return problem.mass + (problem.rows.jacobian.T * weight) @ problem.rows.jacobian
 
 
-def _hessian(problem: ContactProblem, acceleration: Float[Array, "nv"]) -> Float[Array, "nv nv"]:
-    active = problem.jacobian @ acceleration < problem.reference
-    weight = jnp.where(active, problem.stiffness, 0)
-    return problem.mass + (problem.jacobian.T * weight) @ problem.jacobian
+def _line_search(
+    problem: ContactProblem,
+    direction: Float[Array, "nv"],
+    slope: Float[Array, ""],
+    excess: Float[Array, "rows"],
+    change: Float[Array, "rows"],
+) -> Float[Array, ""]:
+    """Step length at which the cost's slope along the direction is nearly zero: Newton from 1, held in its bracket.
 
-
-def _line_search(problem: ContactProblem, start: Float[Array, "nv"], direction: Float[Array, "nv"]) -> Float[Array, ""]:
-    """Step length whose slope along the direction is nearly zero; Newton from 1, held in its bracket."""
-    row, row_slope = problem.jacobian @ start - problem.reference, problem.jacobian @ direction
-    linear = direction @ (problem.mass @ start - problem.force)
+    Args:
+        problem: the contact problem.
+        direction: where to go.
+        slope: the cost's slope at length 0, negative.
+        excess: J q - a at length 0.
+        change: J times the direction.
+    """
+    push, before = problem.rows.stiffness * change, jnp.minimum(excess, 0)
     quadratic = direction @ (problem.mass @ direction)
-    low, high, length = jnp.zeros_like(linear), jnp.full_like(linear, 2), jnp.ones_like(linear)
+    low, high, length = jnp.zeros_like(slope), jnp.full_like(slope, 2), jnp.ones_like(slope)
     for _ in range(LINE_SEARCH_ITERATIONS):
-        force = problem.stiffness * row_slope
-        active = row + length * row_slope < 0
-        slope = linear + length * quadratic + jnp.sum(jnp.where(active, force * (row + length * row_slope), 0))
-        curvature = quadratic + jnp.sum(jnp.where(active, force * row_slope, 0))
-        low, high = jnp.where(slope < 0, length, low), jnp.where(slope < 0, high, length)
-        proposal = length - slope / jnp.where(curvature > 0, curvature, 1)
-        inside = (proposal >= low) & (proposal <= high)
-        length = jnp.where(inside, proposal, 0.5 * (low + high))
+        there = excess + length * change
+        here = slope + length * quadratic + push @ (jnp.minimum(there, 0) - before)
+        curvature = quadratic + jnp.sum(jnp.where(there < 0, push * change, 0))
+        low, high = jnp.where(here < 0, length, low), jnp.where(here < 0, high, length)
+        proposal = length - here / jnp.where(curvature > 0, curvature, 1)
+        length = jnp.where((proposal >= low) & (proposal <= high), proposal, 0.5 * (low + high))
     return length
 
 
-def _solve(matrix: Float[Array, "nv nv"], vector: Float[Array, "nv"]) -> Float[Array, "nv"]:
-    """Solves a symmetric positive definite system."""
+def solve(matrix: Float[Array, "nv nv"], vector: Float[Array, "nv"]) -> Float[Array, "nv"]:
+    """Solves a symmetric positive definite system, such as one with the mass matrix."""
     return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(matrix, symmetrize_input=False), True), vector)

@@ -1,11 +1,14 @@
 """One physics step, composed from MJX's parts so that it can be differentiated exactly, contacts included.
 
+    (state, control)          -> dynamics: mass, smooth force, integrator terms, rows among the free bodies
+    (state, one road user)    -> contact rows of that user, for every user alike (vmap)
+    problem = dynamics + rows -> solution (no derivative) -> exact derivative -> integrate -> state
+
 Values equal `mjx.step` with a converged solver, with one deliberate difference: an actuator whose force is clamped
 contributes no velocity derivative to the implicit integrator, as in C MuJoCo and unlike MJX 3.17 (a car sliding
 sideways would stop too late). Only the state travels from step to step; the rest of `mjx.Data` is rebuilt.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,9 +20,9 @@ from jax import lax
 from jaxtyping import Array, Float
 from mujoco import mjx
 
-from rtc_mjx.errors import NonFiniteError, UsageError
+from rtc_mjx.errors import UsageError
 from rtc_mjx.physics import contact
-from rtc_mjx.physics.world import World
+from rtc_mjx.physics.world import Part, World
 
 Solver = Literal["newton", "mjx"]
 
@@ -54,6 +57,24 @@ class Surroundings:
     size: Float[Array, "users 2"]
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Dynamics:
+    """What a state and a control determine without the road users.
+
+    Attributes:
+        mass: joint-space inertia M.
+        force: all smooth forces, N and N m.
+        implicit: M - h dforce/dvelocity, the matrix of the integrator.
+        rows: constraint rows among the free bodies.
+    """
+
+    mass: Float[Array, "nv nv"]
+    force: Float[Array, "nv"]
+    implicit: Float[Array, "nv nv"]
+    rows: contact.Rows
+
+
 def rest_state(world: World) -> PhysicsState:
     """The asset's own configuration, at rest."""
     warm = world.mj.nv if constraint_rows(world) else 0
@@ -62,17 +83,17 @@ def rest_state(world: World) -> PhysicsState:
 
 
 def rest_surroundings(world: World) -> Surroundings:
-    """Mocap bodies where the asset puts them, with the asset's sizes."""
-    ids = np.flatnonzero(world.mj.body_mocapid >= 0)[np.argsort(world.mj.body_mocapid[world.mj.body_mocapid >= 0])]
-    position, quaternion = world.mj.body_pos[ids], world.mj.body_quat[ids]
+    """Mocap bodies where the asset puts them, with the asset's sizes; bodies that collide with nothing get size 0."""
+    position, quaternion = world.mj.body_pos[list(world.mocap_ids)], world.mj.body_quat[list(world.mocap_ids)]
     heading = 2 * np.arctan2(quaternion[:, 3], quaternion[:, 0])
     pose = np.concatenate([position[:, :2], heading[:, None]], axis=1)
-    return Surroundings(pose=jnp.asarray(pose), size=jnp.asarray(np.nan_to_num(world.default_sizes)))
+    dtype = jnp.zeros(()).dtype
+    return Surroundings(pose=jnp.asarray(pose, dtype), size=jnp.asarray(np.nan_to_num(world.default_sizes), dtype))
 
 
 def constraint_rows(world: World) -> int:
     """Number of constraint rows (contacts and joint limits) of the world."""
-    return int(world.mjx_data()._impl.efc_J.shape[0])
+    return world.free.rows + len(world.users) * len(world.one_user.user_rows) if world.one_user else world.free.rows
 
 
 def step(
@@ -94,121 +115,88 @@ def step(
     Returns:
         The state after the step; its reverse-mode derivative is exact wherever no contact starts or ends.
     """
-    model = _with_sizes(world, surroundings)
-    data = _forward(world, model, state, control, surroundings)
-    mass = mjx.full_m(model, data) if mjx.is_sparse(model) else data._impl.M
-    if constraint_rows(world):
-        problem = _problem(data, mass)
-        acceleration = contact.exact(problem, _solve(model, data, problem, solver))
-        force, warmstart = mass @ acceleration, acceleration
-    else:
-        force, warmstart = data.qfrc_smooth, state.warmstart
-    return _integrate(world, model, data, mass, force, warmstart)
+    terms = dynamics(world, state, control)
+    if not constraint_rows(world):
+        return integrate(world, state, terms, terms.force, state.warmstart)
+    problem = assemble(terms, user_rows(world, state, surroundings))
+    solution = _solution(world, problem, state.warmstart, solver)
+    return finish(world, state, terms, problem, solution)
 
 
 def contact_problem(
     world: World, state: PhysicsState, control: Float[Array, "controls"], surroundings: Surroundings
 ) -> contact.ContactProblem:
     """The contact problem that `step` solves in this state; for checks of a solver, not for stepping."""
-    model = _with_sizes(world, surroundings)
-    data = _forward(world, model, state, control, surroundings)
-    return _problem(data, mjx.full_m(model, data) if mjx.is_sparse(model) else data._impl.M)
+    return assemble(dynamics(world, state, control), user_rows(world, state, surroundings))
 
 
-def simulate(
-    world: World,
-    state: PhysicsState,
-    controls: Float[Array, "steps controls"],
-    surroundings: Surroundings,
-    *,
-    substeps: int = 1,
-    one_step: Callable[..., PhysicsState] | None = None,
-) -> tuple[PhysicsState, PhysicsState]:
-    """Rolls one world forward under given controls, each held for `substeps` physics steps.
-
-    Args:
-        world: the world.
-        state: the first state.
-        controls: one control vector per control step.
-        surroundings: mocap bodies; leaves with a leading axis of `steps` are played back, others stand still.
-        substeps: physics steps per control step.
-        one_step: (state, control, surroundings) -> state, such as a specialised step; `step` on this world if None.
-
-    Returns:
-        The last state, and the states after each control step (leading axis `steps`).
-
-    Raises:
-        NonFiniteError: a concrete input holds NaN or infinity; the error names the field and the index.
-        UsageError: the controls do not fit the world.
-    """
-    check_inputs(world, state, controls, surroundings)
-    played = surroundings.pose.ndim == 3
-    advance = one_step or (lambda *inputs: step(world, *inputs))
-
-    def control_step(state: PhysicsState, inputs: tuple[Array, Surroundings | None]) -> tuple[PhysicsState, PhysicsState]:
-        control, moved = inputs
-        around = surroundings if moved is None else moved
-        state = lax.scan(lambda s, _: (advance(s, control, around), None), state, length=substeps)[0]
-        return state, state
-
-    body = control_step if substeps == 1 and one_step is not None else jax.checkpoint(control_step)
-    return lax.scan(body, state, (controls, surroundings if played else None))
+def dynamics(world: World, state: PhysicsState, control: Float[Array, "controls"]) -> Dynamics:
+    """Mass, smooth forces and rows of the free bodies (first line of the module docstring)."""
+    part = world.free
+    model, data = part.mjx_model(), _positioned(part, part.mjx_model(), state)
+    data = data.replace(ctrl=jnp.zeros(part.mj.nu).at[np.array(world.control_ids, int)].set(control))
+    data = mjx.fwd_velocity(model, mjx.transmission(model, mjx.factor_m(model, mjx.crb(model, data))))
+    data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
+    mass = mjx.full_m(model, data) if mjx.is_sparse(model) else data._impl.M
+    implicit = mass - world.timestep * _velocity_derivative(part.mj, model, data)
+    return Dynamics(mass, data.qfrc_smooth, implicit, _rows(part, model, data, slice(None)))
 
 
-def check_inputs(world: World, state: PhysicsState, controls: Array, surroundings: Surroundings) -> None:
-    """Raises before anything is compiled where a control vector has the wrong width or a concrete input is not finite."""
-    if controls.shape[-1] != len(world.control_ids):
-        wanted = f"{len(world.control_ids)} ({', '.join(world.control_names)})"
-        raise UsageError(f"controls have {controls.shape[-1]} columns; world '{world.name}' takes {wanted}")
-    named = {"state.qpos": state.qpos, "state.qvel": state.qvel, "state.warmstart": state.warmstart}
-    named |= {"controls": controls, "surroundings.pose": surroundings.pose, "surroundings.size": surroundings.size}
-    for name, value in named.items():
-        if isinstance(value, jax.core.Tracer):
-            continue  # inside a compiled program values are not known; what computes them is checked there
-        bad = np.argwhere(~np.isfinite(np.asarray(value)))
-        if bad.size:
-            index = tuple(int(i) for i in bad[0])
-            raise NonFiniteError(f"{name}{list(index)} is {np.asarray(value)[index]} in world '{world.name}'; finite values are needed")
+def user_rows(world: World, state: PhysicsState, surroundings: Surroundings) -> contact.Rows:
+    """Contact rows of every road user, user by user."""
+    if not world.one_user:
+        return contact.Rows(jnp.zeros((0, world.mj.nv)), jnp.zeros(0), jnp.zeros(0))
+    users = jnp.array(world.users, int)
+    rows = jax.vmap(lambda pose, size: one_user_rows(world, state, pose, size))(surroundings.pose[users], surroundings.size[users])
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
 
 
-def _with_sizes(world: World, surroundings: Surroundings) -> mjx.Model:
-    model = world.mjx_model()
-    users = [(row, geom) for row, geom in enumerate(world.user_geoms) if geom >= 0]
-    if not users:
-        return model
-    rows, geoms = np.array(users).T
-    length, width = surroundings.size[rows, 0], surroundings.size[rows, 1]
-    radius = 0.5 * jnp.minimum(length, width)
-    half = 0.5 * jnp.maximum(length - width, 0)
-    sizes = jnp.stack([radius, half, jnp.zeros_like(half)], axis=1)
-    return model.replace(geom_size=jnp.asarray(model.geom_size).at[geoms].set(sizes))
+def one_user_rows(world: World, state: PhysicsState, pose: Float[Array, "3"], size: Float[Array, "2"]) -> contact.Rows:
+    """Contact rows between the free bodies and one road user at a pose, with a length and a width."""
+    part = world.one_user
+    radius, half = 0.5 * jnp.minimum(size[0], size[1]), 0.5 * jnp.maximum(size[0] - size[1], 0)
+    model = part.mjx_model()
+    capsule = jnp.stack([radius, half, jnp.zeros_like(half)])
+    model = model.replace(geom_size=jnp.asarray(model.geom_size).at[part.user_geom].set(capsule))
+    data = _positioned(part, model, state, pose)
+    return _rows(part, model, data, np.array(part.user_rows))
 
 
-def _forward(world: World, model: mjx.Model, state: PhysicsState, control: Array, surroundings: Surroundings) -> mjx.Data:
-    """Everything up to the contact problem: positions, collisions, constraint rows, smooth forces."""
-    ids = np.flatnonzero(world.mj.body_mocapid >= 0)[np.argsort(world.mj.body_mocapid[world.mj.body_mocapid >= 0])]
-    x, y, heading = surroundings.pose.T
-    nothing = jnp.zeros_like(x)
-    data = world.mjx_data().replace(
-        qpos=state.qpos,
-        qvel=state.qvel,
-        ctrl=jnp.zeros(world.mj.nu).at[np.array(world.control_ids, int)].set(control),
-        mocap_pos=jnp.stack([x, y, jnp.asarray(world.mj.body_pos[ids, 2], x.dtype)], axis=1),
-        mocap_quat=jnp.stack([jnp.cos(heading / 2), nothing, nothing, jnp.sin(heading / 2)], axis=1),
-    )
-    if state.warmstart.size:
-        data = data.replace(qacc_warmstart=state.warmstart)
-    data = mjx.fwd_velocity(model, _fwd_position(world, model, data))
-    return mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
+def assemble(terms: Dynamics, users: contact.Rows) -> contact.ContactProblem:
+    """The contact problem of one step."""
+    rows = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), terms.rows, users)
+    return contact.ContactProblem(terms.mass, terms.force, rows)
 
 
-def _fwd_position(world: World, model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """`mjx.fwd_position` without cameras and tendons, and with contact frames that suit a planar world."""
-    data = mjx.factor_m(model, mjx.crb(model, mjx.com_pos(model, mjx.kinematics(model, data))))
+def finish(world: World, state: PhysicsState, terms: Dynamics, problem: contact.ContactProblem, solution: Array) -> PhysicsState:
+    """From a solution of the contact problem to the next state, with the exact derivative."""
+    acceleration = contact.exact(problem, solution)
+    return integrate(world, state, terms, terms.mass @ acceleration, acceleration)
+
+
+def integrate(world: World, state: PhysicsState, terms: Dynamics, force: Array, warmstart: Array) -> PhysicsState:
+    """Implicit in the velocity derivative that the integrator takes, semi-implicit in position."""
+    qvel = state.qvel + world.timestep * contact.solve(terms.implicit, force)
+    return PhysicsState(qpos=state.qpos + world.timestep * qvel, qvel=qvel, warmstart=warmstart)
+
+
+def _positioned(part: Part, model: mjx.Model, state: PhysicsState, pose: Array | None = None) -> mjx.Data:
+    """Kinematics of one part of the world."""
+    data = part.mjx_data().replace(qpos=state.qpos, qvel=state.qvel)
+    if pose is not None:
+        height, nothing = jnp.asarray(part.mj.body_pos[part.user_body, 2], pose.dtype), jnp.zeros((), pose.dtype)
+        turned = jnp.stack([jnp.cos(pose[2] / 2), nothing, nothing, jnp.sin(pose[2] / 2)])
+        data = data.replace(mocap_pos=jnp.stack([pose[0], pose[1], height])[None], mocap_quat=turned[None])
+    return mjx.com_pos(model, mjx.kinematics(model, data))
+
+
+def _rows(part: Part, model: mjx.Model, data: mjx.Data, wanted: slice | np.ndarray) -> contact.Rows:
+    """Collides and makes constraint rows, in contact frames that suit a planar world."""
     data = mjx.collision(model, data)
-    if world.planar and data._impl.ncon:
+    if part.planar and data._impl.ncon:
         data = data.tree_replace({"_impl.contact.frame": _planar_frames(data._impl.contact.frame)})
-    return mjx.transmission(model, mjx.make_constraint(model, data))
+    rows = mjx.make_constraint(model, data)._impl
+    return contact.Rows(rows.efc_J[wanted], rows.efc_D[wanted], rows.efc_aref[wanted])
 
 
 def _planar_frames(frames: Float[Array, "contacts 3 3"]) -> Float[Array, "contacts 3 3"]:
@@ -223,43 +211,45 @@ def _planar_frames(frames: Float[Array, "contacts 3 3"]) -> Float[Array, "contac
     return jnp.stack([jnp.stack(row, axis=1) for row in rows], axis=1)
 
 
-def _problem(data: mjx.Data, mass: Array) -> contact.ContactProblem:
-    rows = data._impl
-    return contact.ContactProblem(mass, data.qfrc_smooth, rows.efc_J, rows.efc_D, rows.efc_aref)
-
-
-def _solve(model: mjx.Model, data: mjx.Data, problem: contact.ContactProblem, solver: Solver) -> Array:
-    if solver == "mjx":
-        return mjx.solve(*lax.stop_gradient((model, data))).qacc
+def _solution(world: World, problem: contact.ContactProblem, start: Array, solver: Solver) -> Array:
+    """A converged solution without derivative."""
+    problem, start = lax.stop_gradient((problem, start))
     if solver == "newton":
-        problem = lax.stop_gradient(problem)
-        return contact.newton(problem, contact.warm_start(problem, lax.stop_gradient(data.qacc_warmstart)))
+        return contact.newton(problem, start)
+    if solver == "mjx":
+        return _mjx_solution(world.free, problem, start)
     raise UsageError(f"solver '{solver}' is not one of newton, mjx")
 
 
-def _integrate(world: World, model: mjx.Model, data: mjx.Data, mass: Array, force: Array, warmstart: Array) -> PhysicsState:
-    """Implicit in the velocity derivative that the integrator takes, semi-implicit in position."""
-    h = world.timestep
-    rate = _velocity_derivative(world, model, data)
-    acceleration = contact._solve(mass - h * rate, force)
-    qvel = data.qvel + h * acceleration
-    return PhysicsState(qpos=data.qpos + h * qvel, qvel=qvel, warmstart=warmstart)
+def _mjx_solution(part: Part, problem: contact.ContactProblem, start: Array) -> Array:
+    """MJX's solver, handed our rows through the `mjx.Data` it reads."""
+    model, data, rows = part.dense.mjx_model(), part.dense.mjx_data(), problem.rows
+    nothing = jnp.zeros_like(rows.stiffness)
+    data = data.replace(
+        qfrc_smooth=problem.force, qacc_smooth=contact.solve(problem.mass, problem.force), qacc_warmstart=start
+    )
+    factor = jax.scipy.linalg.cho_factor(problem.mass)[0]
+    data = data.tree_replace({
+        "_impl.M": problem.mass, "_impl.qLD": factor, "_impl.efc_J": rows.jacobian, "_impl.efc_D": rows.stiffness,
+        "_impl.efc_aref": rows.reference, "_impl.nefc": rows.reference.shape[0], "_impl.efc_frictionloss": nothing, "_impl.efc_force": nothing,
+    })  # fmt: skip
+    return mjx.solve(model, data).qacc
 
 
-def _velocity_derivative(world: World, model: mjx.Model, data: mjx.Data) -> Float[Array, "nv nv"]:
+def _velocity_derivative(mj: mujoco.MjModel, model: mjx.Model, data: mjx.Data) -> Float[Array, "nv nv"]:
     """d force / d velocity as the integrator uses it: joint damping, and for implicitfast the actuators not clamped."""
     damping = jnp.diag(-jnp.asarray(model.dof_damping))
-    if world.mj.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
-        off = world.mj.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_EULERDAMP | mujoco.mjtDisableBit.mjDSBL_DAMPER)
+    if mj.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
+        off = mj.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_EULERDAMP | mujoco.mjtDisableBit.mjDSBL_DAMPER)
         return jnp.zeros_like(damping) if off else damping
-    if not world.mj.nu:
+    if not mj.nu:
         return damping
-    affine = world.mj.actuator_gaintype == mujoco.mjtGain.mjGAIN_AFFINE
-    per_control = np.where(affine, world.mj.actuator_gainprm[:, 2], 0.0)
-    biased = world.mj.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
-    slope = np.where(biased, world.mj.actuator_biasprm[:, 2], 0.0) + per_control * data.ctrl
-    low, high = world.mj.actuator_forcerange.T
-    limited = world.mj.actuator_forcelimited.astype(bool)
+    affine = mj.actuator_gaintype == mujoco.mjtGain.mjGAIN_AFFINE
+    per_control = np.where(affine, mj.actuator_gainprm[:, 2], 0.0)
+    biased = mj.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
+    slope = np.where(biased, mj.actuator_biasprm[:, 2], 0.0) + per_control * data.ctrl
+    low, high = mj.actuator_forcerange.T
+    limited = mj.actuator_forcelimited.astype(bool)
     clamped = limited & ((data.actuator_force <= low) | (data.actuator_force >= high))
     slope = jnp.where(clamped, 0, slope)  # C MuJoCo skips these in its derivative, MJX 3.17 does not
     moment = data._impl.actuator_moment

@@ -4,9 +4,11 @@
 step does not cover (`check_supported`), and returns a `World`: the compiled model plus the few indices the step needs.
 """
 
+import copy
 import functools
 import hashlib
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -26,24 +28,67 @@ JOINTS = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
 
 
 @dataclass(frozen=True, eq=False)
+class Part:
+    """One compiled model of a world: the free bodies alone, or with one road user.
+
+    Attributes:
+        mj: the compiled model.
+        planar: whether all that collides moves in one horizontal plane, with friction equal in all directions.
+        user_body: the road user's body, or -1.
+        user_geom: its collision capsule, or -1.
+        user_rows: numbers of the constraint rows between it and the free bodies.
+    """
+
+    mj: mujoco.MjModel
+    planar: bool
+    user_body: int = -1
+    user_geom: int = -1
+    user_rows: tuple[int, ...] = ()
+
+    def mjx_model(self) -> mjx.Model:
+        """The model on the device, in the precision that JAX is set to at the call."""
+        return _mjx_model(self, jax.config.jax_enable_x64)
+
+    def mjx_data(self) -> mjx.Data:
+        """A template `mjx.Data`; the step rebuilds everything but the state from it."""
+        return _mjx_data(self, jax.config.jax_enable_x64)
+
+    @functools.cached_property
+    def rows(self) -> int:
+        """Number of constraint rows."""
+        return int(self.mjx_data()._impl.efc_J.shape[0])
+
+    @functools.cached_property
+    def dense(self) -> "Part":
+        """The same with dense matrices, as the solver is handed them."""
+        model = copy.copy(self.mj)
+        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+        return Part(model, self.planar)
+
+
+@dataclass(frozen=True, eq=False)
 class World:
-    """A compiled world with the indices that the step reads.
+    """A compiled world with the parts and indices that the step reads.
 
     Attributes:
         name: what it was loaded as; error messages use it.
-        mj: the compiled MuJoCo model.
+        mj: the compiled model of everything, for C MuJoCo and for rendering.
+        free: what moves by itself, and among itself collides.
+        one_user: the same with one replayed road user; None where no mocap body collides.
         control_names: actuators that take a control, in control order; actuators of zero gain (tyres) take none.
         control_ids: their actuator ids.
-        mocap_names: bodies whose pose is given from outside, in mocap order.
-        user_geoms: the id of each mocap body's collision capsule, or -1 where it has none.
+        mocap_ids: bodies whose pose is given from outside, in mocap order.
+        users: which of them collide.
     """
 
     name: str
     mj: mujoco.MjModel
+    free: Part
+    one_user: Part | None
     control_names: tuple[str, ...]
     control_ids: tuple[int, ...]
-    mocap_names: tuple[str, ...]
-    user_geoms: tuple[int, ...]
+    mocap_ids: tuple[int, ...]
+    users: tuple[int, ...]
 
     @property
     def timestep(self) -> float:
@@ -57,23 +102,10 @@ class World:
         mujoco.mj_saveModel(self.mj, None, buffer)
         return hashlib.sha256(buffer.tobytes()).hexdigest()
 
-    @functools.cached_property
-    def planar(self) -> bool:
-        """Whether everything that can collide moves in one horizontal plane, with friction equal in all directions."""
-        return _is_planar(self.mj)
-
-    def mjx_model(self) -> mjx.Model:
-        """The model on the device, in the precision that JAX is set to at the call."""
-        return _mjx_model(self, jax.config.jax_enable_x64)
-
-    def mjx_data(self) -> mjx.Data:
-        """A template `mjx.Data`; the step rebuilds everything but the state from it."""
-        return _mjx_data(self, jax.config.jax_enable_x64)
-
     @property
     def default_sizes(self) -> Float[np.ndarray, "users 2"]:
         """Length and width in m of each mocap body as the asset gives them; NaN where it collides with nothing."""
-        return np.array([_vehicle_size(self.mj, geom) for geom in self.user_geoms]).reshape(-1, 2)
+        return np.array([_vehicle_size(self.mj, _collision_geom(self.mj, body)) for body in self.mocap_ids]).reshape(-1, 2)
 
     def joint(self, name: str) -> int:
         """Index of a joint in qpos and in qvel (the same: every joint has one degree of freedom)."""
@@ -95,17 +127,17 @@ class World:
 
 
 @functools.lru_cache(maxsize=32)
-def _mjx_model(world: World, x64: bool) -> mjx.Model:
+def _mjx_model(part: Part, x64: bool) -> mjx.Model:
     del x64  # part of the key: the arrays carry a precision
     with jax.ensure_compile_time_eval():
-        return mjx.put_model(world.mj, impl="jax")
+        return mjx.put_model(part.mj, impl="jax")
 
 
 @functools.lru_cache(maxsize=32)
-def _mjx_data(world: World, x64: bool) -> mjx.Data:
+def _mjx_data(part: Part, x64: bool) -> mjx.Data:
     del x64
     with jax.ensure_compile_time_eval():
-        return mjx.make_data(world.mj, impl="jax")
+        return mjx.make_data(part.mj, impl="jax")
 
 
 def assets() -> Path:
@@ -138,25 +170,69 @@ def load(name: str | Path, *, cars: int | None = None, road_users: int | None = 
         spec = mujoco.MjSpec.from_file(str(path))
         _copy_cars(spec, path, cars)
         _copy_users(spec, path, road_users)
-        model = spec.compile()
+        return from_spec(spec, name=path.stem)
     except ValueError as error:
         raise error if isinstance(error, UsageError) else UsageError(f"{path}: {' '.join(str(error).split())}") from error
-    return from_model(model, name=path.stem)
 
 
-def from_model(model: mujoco.MjModel, *, name: str = "model") -> World:
-    """Makes a `World` of a compiled model; raises `UnsupportedWorldError` where the step does not cover it."""
+def from_spec(spec: mujoco.MjSpec, *, name: str = "model") -> World:
+    """Makes a `World` of a model specification.
+
+    Raises:
+        UnsupportedWorldError: something in it is outside what the differentiable step covers.
+    """
+    model = spec.compile()
     check_supported(model, name)
-    control_ids = tuple(int(i) for i in range(model.nu) if np.any(model.actuator_gainprm[i]))
     mocap = sorted((int(model.body_mocapid[b]), b) for b in range(model.nbody) if model.body_mocapid[b] >= 0)
+    users = tuple(i for i, b in mocap if _collision_geom(model, b) >= 0)
+    bodies = [model.body(mocap[i][1]).name for i in users]
+    _check_alike(model, [_collision_geom(model, mocap[i][1]) for i in users], name)
+    control_ids = tuple(int(i) for i in range(model.nu) if np.any(model.actuator_gainprm[i]))
     return World(
         name=name,
         mj=model,
+        free=_free_part(spec, bodies),
+        one_user=_one_user_part(spec, bodies) if bodies else None,
         control_names=tuple(model.actuator(i).name for i in control_ids),
         control_ids=control_ids,
-        mocap_names=tuple(model.body(b).name for _, b in mocap),
-        user_geoms=tuple(_collision_geom(model, b) for _, b in mocap),
+        mocap_ids=tuple(b for _, b in mocap),
+        users=users,
     )
+
+
+def _without(spec: mujoco.MjSpec, bodies: Sequence[str]) -> mujoco.MjModel:
+    spec = spec.copy()
+    for body in bodies:
+        spec.delete(spec.body(body))
+    return spec.compile()
+
+
+def _free_part(spec: mujoco.MjSpec, users: Sequence[str]) -> Part:
+    model = _without(spec, users) if users else spec.compile()
+    return Part(model, _is_planar(model))
+
+
+def _one_user_part(spec: mujoco.MjSpec, users: Sequence[str]) -> Part:
+    model = _without(spec, users[1:])
+    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, users[0])
+    geom = _collision_geom(model, body)
+    device = mjx.put_model(model, impl="jax")
+    contacts = jax.jit(lambda data: mjx.collision(device, data)._impl.contact)(mjx.make_data(model, impl="jax"))
+    rows = [
+        int(first) + k
+        for first, dim, pair in zip(*(np.asarray(x) for x in (contacts.efc_address, contacts.dim, contacts.geom)), strict=True)
+        if geom in pair
+        for k in range(1 if dim == 1 else 2 * (int(dim) - 1))
+    ]
+    return Part(model, _is_planar(model), body, geom, tuple(rows))
+
+
+def _check_alike(model: mujoco.MjModel, geoms: Sequence[int], name: str) -> None:
+    fields = ("friction", "solref", "solimp", "condim", "margin", "gap", "contype", "conaffinity", "pos", "quat", "priority", "solmix")
+    for field in fields:
+        values = getattr(model, f"geom_{field}")[list(geoms)]
+        if len(geoms) and not np.all(values == values[0]):
+            raise UnsupportedWorldError(f"world '{name}': colliding mocap bodies differ in {field}; only their sizes may differ")
 
 
 def check_supported(model: mujoco.MjModel, name: str) -> None:

@@ -5,7 +5,7 @@ indices. `specialise` traces a function once, folds it (`graph`, `interpret`), d
 emits it (`emit`). The result is an ordinary JAX function: jit, vmap, scan and reverse-mode grad work on it.
 """
 
-from rtc_mjx.specialise.emit import KERNEL_NODES, Mode, default_mode
-from rtc_mjx.specialise.program import Program, specialise
+from rtc_mjx.specialise.emit import Mode, default_mode
+from rtc_mjx.specialise.program import Program, compress, specialise
 
-__all__ = ["KERNEL_NODES", "Mode", "Program", "default_mode", "specialise"]
+__all__ = ["Mode", "Program", "compress", "default_mode", "specialise"]

@@ -22,7 +22,9 @@ from jax import lax
 from rtc_mjx.specialise.graph import ELEMENTWISE, Graph, Node
 
 Mode = Literal["kernel", "vector"]
-KERNEL_NODES = 1000  # see the module docstring
+KERNEL_OPERATIONS = 1800  # XLA's emitters split a computation of 2,000 and compute shared parts again and again
+KERNEL_SLOTS = 115  # LLVM gives up telling 250 memory locations apart, and with it vectorising
+PER_SLOT = 6  # operations of the reduction itself for each value that goes in or out
 IDENTITY, RESULT = -1, 2  # tags, beside 0 and 1 of the two elements
 Values = dict[Node, Any]
 
@@ -37,7 +39,7 @@ def evaluate(graph: Graph, inputs: dict[Node, Any], outputs: Sequence[Node], mod
     order = [n for n in graph.live(outputs, known=list(inputs)) if n not in inputs and graph.ops[n] != "const"]
     values: Values = dict(inputs)
     last_use = _last_use(graph, order, outputs)
-    for first, part in _parts(graph, order):
+    for first, part in _parts(graph, order, last_use):
         op = graph.ops[part[0]]
         if op == "native":
             _run_native(graph, part[0], values)
@@ -51,20 +53,39 @@ def evaluate(graph: Graph, inputs: dict[Node, Any], outputs: Sequence[Node], mod
     return [_value(graph, n, values) for n in outputs]
 
 
-def _parts(graph: Graph, order: Sequence[Node]) -> Iterator[tuple[int, list[Node]]]:
+def _parts(graph: Graph, order: Sequence[Node], last_use: dict[Node, int]) -> Iterator[tuple[int, list[Node]]]:
     """Cuts an order of evaluation into kernels, native operations apart; yields (position, nodes)."""
     start = 0
-    for position, node in enumerate(order):
-        alone = graph.ops[node] in ("native", "result")
-        if alone or position - start >= KERNEL_NODES:
-            if position > start:
-                yield start, list(order[start:position])
-            start = position
-        if alone:
-            yield position, [node]
-            start = position + 1
-    if start < len(order):
-        yield start, list(order[start:])
+    while start < len(order):
+        if graph.ops[order[start]] in ("native", "result"):
+            end = start + 1
+        else:
+            end = _kernel_end(graph, order, start, last_use)
+        yield start, list(order[start:end])
+        start = end
+
+
+def _kernel_end(graph: Graph, order: Sequence[Node], start: int, last_use: dict[Node, int]) -> int:
+    """Where to end the kernel that begins at `start`: as late as one kernel allows, near where fewest values cross."""
+    inside: set[Node] = set()
+    inputs: set[Node] = set()
+    leaving: dict[int, int] = {}
+    alive, ends = 0, []
+    for position in range(start, len(order)):
+        node = order[position]
+        if graph.ops[node] in ("native", "result"):
+            break
+        alive += 1 - leaving.pop(position, 0)
+        leaving[last_use[node]] = leaving.get(last_use[node], 0) + 1
+        inside.add(node)
+        inputs.update(a for a in graph.args[node] if a not in inside and graph.ops[a] != "const")
+        slots = max(len(inputs), alive)
+        if position + 1 - start + PER_SLOT * slots > KERNEL_OPERATIONS:
+            break
+        ends.append((slots, position + 1))
+    small = [(slots, end) for slots, end in ends if slots <= KERNEL_SLOTS] or [min(ends, default=(0, start + 1))]
+    late = [(slots, end) for slots, end in small if end - start >= 0.6 * (small[-1][1] - start)]
+    return small[-1][1] if small[-1][1] == len(order) else min(late, key=lambda x: (x[0], -x[1]))[1]
 
 
 def _last_use(graph: Graph, order: Sequence[Node], outputs: Sequence[Node]) -> dict[Node, int]:

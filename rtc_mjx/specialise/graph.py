@@ -197,6 +197,16 @@ def _div(g: Graph, x: Node, y: Node) -> Node | None:
     return x if g.equals(x, 0) or g.equals(y, 1) else None
 
 
+def _pow(g: Graph, x: Node, y: Node) -> Node | None:
+    """Small whole powers as products: a solver's impedance is a square, and pow does not vectorise."""
+    if not g.is_constant(y) or g.values[y] not in (0, 1, 2, 3, 4):
+        return None
+    product = g.constant(1, g.dtypes[x])
+    for _ in range(int(g.values[y])):
+        product = g.apply("mul", product, x)
+    return product
+
+
 def _neg(g: Graph, x: Node) -> Node | None:
     if g.ops[x] == "sub":
         return g.apply("sub", g.args[x][1], g.args[x][0])
@@ -237,7 +247,7 @@ def _reflexive(result: bool) -> Callable[[Graph, Node, Node], Node | None]:
 
 
 _IDENTITIES: dict[str, Callable[..., Node | None]] = {
-    "add": _add, "sub": _sub, "mul": _mul, "div": _div, "neg": _neg, "not": _not,
+    "add": _add, "sub": _sub, "mul": _mul, "div": _div, "pow": _pow, "neg": _neg, "not": _not,
     "max": _bound(-np.inf), "min": _bound(np.inf), "and": _junction(True), "or": _junction(False),
     "lt": _reflexive(False), "gt": _reflexive(False), "ne": _reflexive(False),
     "le": _reflexive(True), "ge": _reflexive(True), "eq": _reflexive(True),

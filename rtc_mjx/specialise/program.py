@@ -94,6 +94,37 @@ def specialise(function: Callable[..., Any], *examples: Any, mode: emit.Mode | N
     return wrap(program, structure, jax.tree.structure(examples), mode)
 
 
+def compress(
+    function: Callable[..., Any], *examples: Any, mode: emit.Mode | None = None
+) -> tuple[Callable[..., jax.Array], Callable[[jax.Array], Any]]:
+    """Specialises a function whose result goes into another specialised function, without losing what is known about it.
+
+    Returns:
+        compact: the function, with its result as one vector of the scalars that are neither constant nor equal to another.
+        expand: from that vector to the result; traced inside the next function it restores constants and equalities.
+    """
+    program, structure = trace(function, *examples)
+    graph, flat = program.graph, program.output_nodes
+    distinct = [n for n in dict.fromkeys(flat) if not graph.is_constant(n)]
+    place = {n: i for i, n in enumerate(distinct)}
+    dtypes = {graph.dtypes[n] for n in distinct}
+    if len(dtypes) > 1:
+        raise UsageError(f"results of one type are needed to pack them, got {sorted(str(d) for d in dtypes)}")
+
+    def expand(vector: jax.Array) -> Any:
+        arrays = []
+        for nodes in program.outputs:
+            known = [graph.values[int(n)] if graph.is_constant(int(n)) else 0 for n in nodes.flat]
+            places = np.array([place.get(int(n), -1) for n in nodes.flat], np.int64)
+            base = jnp.asarray(np.array(known).reshape(nodes.shape), vector.dtype).reshape(-1)
+            moving = np.flatnonzero(places >= 0)
+            arrays.append(base.at[moving].set(vector[places[moving]]).reshape(nodes.shape) if moving.size else base.reshape(nodes.shape))
+        return jax.tree.unflatten(structure, arrays)
+
+    packed = Program(graph, program.inputs, (np.array(distinct, np.int64),))
+    return wrap(packed, jax.tree.structure(0), jax.tree.structure(examples), mode), expand
+
+
 def trace(function: Callable[..., Any], *examples: Any) -> tuple[Program, Any]:
     """Traces and folds; returns the program and the structure of the function's result."""
     leaves = [jax.ShapeDtypeStruct(np.shape(x), jax.dtypes.canonicalize_dtype(x.dtype)) for x in jax.tree.leaves(examples)]

@@ -1,0 +1,99 @@
+"""The step of one world, specialised stage by stage: the same values and derivatives, many times faster.
+
+The stages are those of `rtc_mjx.physics.step`. Each is folded to scalar arithmetic by `rtc_mjx.specialise`; the rows of a road user
+are one small program run for all users and worlds at once. What a stage knows to be constant or equal (the zeros of a planar
+world, the two pyramid edges along z) is handed to the next as such, not as data.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.ad_checkpoint import checkpoint_name
+from jaxtyping import Array
+
+from rtc_mjx.physics import contact
+from rtc_mjx.physics.rollout import OneStep
+from rtc_mjx.physics.step import (
+    Dynamics,
+    PhysicsState,
+    Surroundings,
+    assemble,
+    constraint_rows,
+    dynamics,
+    finish,
+    integrate,
+    one_user_rows,
+    rest_state,
+    rest_surroundings,
+)
+from rtc_mjx.physics.world import World
+from rtc_mjx.specialise import Mode, compress, specialise
+
+
+@functools.lru_cache(maxsize=16)
+def specialised_step(world: World, mode: Mode | None = None) -> OneStep:
+    """Returns `step` of this world, specialised: (state, control, surroundings) -> state.
+
+    Args:
+        world: the world; tracing it takes a few seconds.
+        mode: how to emit (`rtc_mjx.specialise.specialise`); None for what suits the device.
+
+    Returns:
+        A function to vmap over worlds, scan over time and differentiate in reverse mode. Inside `jax.checkpoint` with a policy
+        that keeps `contact.SOLUTION`, a backward pass does not solve the contact problem again (`simulate` does this).
+    """
+    state, control = rest_state(world), jnp.zeros(len(world.control_ids))
+    terms, as_terms = compress(lambda s, c: dynamics(world, s, c), state, control, mode=mode)
+    packed = jax.eval_shape(terms, state, control)
+    if not constraint_rows(world):
+        last = specialise(lambda s, t: _free_flight(world, s, as_terms(t)), state, packed, mode=mode)
+        return lambda s, c, _: last(s, terms(s, c))
+    rows, as_rows, users = _rows_stage(world, state, mode)
+
+    def problem(terms_vector: Array, rows_vectors: Array) -> tuple[Dynamics, contact.ContactProblem]:
+        parts = [as_rows(rows_vectors[i]) for i in range(len(world.users))] or [_no_rows(world)]
+        stacked = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+        return as_terms(terms_vector), assemble(as_terms(terms_vector), stacked)
+
+    def solve(start: Array, terms_vector: Array, rows_vectors: Array) -> Array:
+        return contact.newton(problem(terms_vector, rows_vectors)[1], start)
+
+    def conclude(s: PhysicsState, terms_vector: Array, rows_vectors: Array, solution: Array) -> PhysicsState:
+        return finish(world, s, *problem(terms_vector, rows_vectors), solution)
+
+    row_shapes = jax.eval_shape(users, state, rest_surroundings(world))
+    solver = specialise(solve, state.warmstart, packed, row_shapes, mode=mode)
+    last = specialise(conclude, state, packed, row_shapes, state.warmstart, mode=mode)
+
+    def one_step(s: PhysicsState, c: Array, around: Surroundings) -> PhysicsState:
+        free, touching = terms(s, c), users(s, around)
+        solution = solver(*lax.stop_gradient((s.warmstart, free, touching)))  # its derivative is implicit: see contact.exact
+        return last(s, free, touching, checkpoint_name(solution, contact.SOLUTION))
+
+    return one_step
+
+
+def _rows_stage(world: World, state: PhysicsState, mode: Mode | None) -> tuple[Any, Callable[..., contact.Rows], Callable[..., Array]]:
+    """The rows of one user as a program, and that program over all users."""
+    if not world.one_user:
+        return None, lambda vector: _no_rows(world), lambda s, around: jnp.zeros((0, 0), s.qpos.dtype)
+    pose, size = jnp.zeros(3), jnp.zeros(2)
+    rows, as_rows = compress(lambda s, p, z: one_user_rows(world, s, p, z), state, pose, size, mode=mode)
+    index = jnp.array(world.users, int)
+
+    def over_users(s: PhysicsState, around: Surroundings) -> Array:
+        return jax.vmap(rows, in_axes=(None, 0, 0))(s, around.pose[index], around.size[index])
+
+    return rows, as_rows, over_users
+
+
+def _no_rows(world: World) -> contact.Rows:
+    return contact.Rows(jnp.zeros((0, world.mj.nv)), jnp.zeros(0), jnp.zeros(0))
+
+
+def _free_flight(world: World, state: PhysicsState, terms: Dynamics) -> PhysicsState:
+    return integrate(world, state, terms, terms.force, state.warmstart)

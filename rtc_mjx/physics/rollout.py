@@ -1,0 +1,81 @@
+"""Rolling one world forward under given controls, differentiably and in little memory."""
+
+from collections.abc import Callable
+
+import jax
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from rtc_mjx.errors import NonFiniteError, UsageError
+from rtc_mjx.physics.contact import SOLUTION
+from rtc_mjx.physics.step import PhysicsState, Surroundings, step
+from rtc_mjx.physics.world import World
+
+OneStep = Callable[[PhysicsState, Array, Surroundings], PhysicsState]
+
+
+def simulate(
+    world: World,
+    state: PhysicsState,
+    controls: Float[Array, "steps controls"],
+    surroundings: Surroundings,
+    *,
+    substeps: int = 1,
+    one_step: OneStep | None = None,
+) -> tuple[PhysicsState, PhysicsState]:
+    """Rolls one world forward under given controls, each held for `substeps` physics steps.
+
+    A backward pass keeps the state before each control step and the contact solution of each physics step in one control
+    step at a time; the rest is computed again.
+
+    Args:
+        world: the world.
+        state: the first state.
+        controls: one control vector per control step.
+        surroundings: mocap bodies; leaves with a leading axis of `steps` are played back, others stand still.
+        substeps: physics steps per control step.
+        one_step: (state, control, surroundings) -> state, such as `specialised_step(world)`; `step` on this world if None.
+
+    Returns:
+        The last state, and the states after each control step (leading axis `steps`).
+
+    Raises:
+        NonFiniteError: a concrete input holds NaN or infinity; the error names the field and the index.
+        UsageError: the controls do not fit the world.
+    """
+    check_inputs(world, state, controls, surroundings)
+    played = surroundings.pose.ndim == 3
+    keep = jax.checkpoint_policies.save_only_these_names(SOLUTION)
+    advance = jax.checkpoint(one_step or (lambda *inputs: step(world, *inputs)), policy=keep)
+
+    def control_step(state: PhysicsState, inputs: tuple[Array, Surroundings | None]) -> tuple[PhysicsState, PhysicsState]:
+        control, moved = inputs
+        around = surroundings if moved is None else moved
+        if substeps == 1:
+            state = advance(state, control, around)
+        else:
+            state = lax.scan(lambda s, _: (advance(s, control, around), None), state, length=substeps)[0]
+        return state, state
+
+    body = control_step if substeps == 1 else jax.checkpoint(control_step)
+    return lax.scan(body, state, (controls, surroundings if played else None))
+
+
+def check_inputs(world: World, state: PhysicsState, controls: Array, surroundings: Surroundings) -> None:
+    """Raises before anything is compiled where shapes do not fit the world or a concrete input is not finite."""
+    if controls.shape[-1] != len(world.control_ids):
+        wanted = f"{len(world.control_ids)} ({', '.join(world.control_names)})"
+        raise UsageError(f"controls have {controls.shape[-1]} columns; world '{world.name}' takes {wanted}")
+    if surroundings.pose.shape[-2] != len(world.mocap_ids):
+        raise UsageError(f"surroundings have {surroundings.pose.shape[-2]} bodies; world '{world.name}' has {len(world.mocap_ids)}")
+    named = {"state.qpos": state.qpos, "state.qvel": state.qvel, "state.warmstart": state.warmstart}
+    named |= {"controls": controls, "surroundings.pose": surroundings.pose, "surroundings.size": surroundings.size}
+    for name, value in named.items():
+        if isinstance(value, jax.core.Tracer):
+            continue  # inside a compiled program values are not known; what computes them is checked there
+        value = np.asarray(value)
+        bad = np.argwhere(~np.isfinite(value))
+        if bad.size:
+            index = tuple(int(i) for i in bad[0])
+            raise NonFiniteError(f"{name}{list(index)} is {value[index]} in world '{world.name}'; finite values are needed")
