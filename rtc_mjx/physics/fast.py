@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array
@@ -59,19 +60,20 @@ def specialised_step(world: World, mode: Mode | None = None) -> OneStep:
         stacked = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
         return as_terms(terms_vector), assemble(as_terms(terms_vector), stacked)
 
-    def solve(start: Array, terms_vector: Array, rows_vectors: Array) -> Array:
-        return contact.newton(problem(terms_vector, rows_vectors)[1], start)
+    def newton_step(start: Array, terms_vector: Array, rows_vectors: Array) -> tuple[Array, Array]:
+        return contact.newton_step(problem(terms_vector, rows_vectors)[1], start)
 
     def conclude(s: PhysicsState, terms_vector: Array, rows_vectors: Array, solution: Array) -> PhysicsState:
         return finish(world, s, *problem(terms_vector, rows_vectors), solution)
 
     row_shapes = jax.eval_shape(users, state, rest_surroundings(world))
-    solver = specialise(solve, state.warmstart, packed, row_shapes, mode=mode)
+    advance = specialise(newton_step, state.warmstart, packed, row_shapes, mode=mode)
     last = specialise(conclude, state, packed, row_shapes, state.warmstart, mode=mode)
 
     def one_step(s: PhysicsState, c: Array, around: Surroundings) -> PhysicsState:
         free, touching = terms(s, c), users(s, around)
-        solution = solver(*lax.stop_gradient((s.warmstart, free, touching)))  # its derivative is implicit: see contact.exact
+        start, held, near = lax.stop_gradient((s.warmstart, free, touching))  # the derivative is implicit: see contact.exact
+        solution, _ = contact.newton(None, start, lambda q: advance(q, held, near))
         return last(s, free, touching, checkpoint_name(solution, contact.SOLUTION))
 
     return one_step
@@ -82,13 +84,44 @@ def _rows_stage(world: World, state: PhysicsState, mode: Mode | None) -> tuple[A
     if not world.one_user:
         return None, lambda vector: _no_rows(world), lambda s, around: jnp.zeros((0, 0), s.qpos.dtype)
     pose, size = jnp.zeros(3), jnp.zeros(2)
-    rows, as_rows = compress(lambda s, p, z: one_user_rows(world, s, p, z), state, pose, size, mode=mode)
+    halve, restore = (_halved, _restored) if _is_flat_pyramid(world) else (lambda rows: rows, lambda rows: rows)
+    rows, expand = compress(lambda s, p, z: halve(one_user_rows(world, s, p, z)), state, pose, size, mode=mode)
     index = jnp.array(world.users, int)
 
     def over_users(s: PhysicsState, around: Surroundings) -> Array:
         return jax.vmap(rows, in_axes=(None, 0, 0))(s, around.pose[index], around.size[index])
 
-    return rows, as_rows, over_users
+    return rows, lambda vector: restore(expand(vector)), over_users
+
+
+def _is_flat_pyramid(world: World) -> bool:
+    """Whether a user's rows are the pyramids of planar contacts with sliding friction, four rows each."""
+    contacts = world.one_user.mjx_data()._impl.contact
+    return world.one_user.planar and bool(np.all(np.asarray(contacts.dim) == 3))
+
+
+def _halved(rows: contact.Rows) -> dict[str, Array]:
+    """Planar pyramids (n + t, n - t, n, n) as n and t: less than half the numbers to hand on."""
+    jacobian, reference = rows.jacobian.reshape(-1, 4, rows.jacobian.shape[-1]), rows.reference.reshape(-1, 4)
+    return {
+        "normal": jacobian[:, 2],
+        "tangent": jacobian[:, 0] - jacobian[:, 2],
+        "reference_normal": reference[:, 2],
+        "reference_tangent": reference[:, 0] - reference[:, 2],
+        "stiffness": rows.stiffness.reshape(-1, 4)[:, 0],
+    }
+
+
+def _restored(parts: dict[str, Array]) -> contact.Rows:
+    """The rows of `_halved`."""
+
+    def edges(normal: Array, tangent: Array) -> Array:
+        whole = jnp.stack([normal + tangent, normal - tangent, normal, normal], axis=1)
+        return whole.reshape(-1, *whole.shape[2:])
+
+    jacobian = edges(parts["normal"], parts["tangent"])
+    reference = edges(parts["reference_normal"], parts["reference_tangent"])
+    return contact.Rows(jacobian, jnp.repeat(parts["stiffness"], 4), reference)
 
 
 def _no_rows(world: World) -> contact.Rows:

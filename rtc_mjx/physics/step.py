@@ -110,7 +110,7 @@ def step(
         state: state before the step.
         control: one value per `world.control_names`, in the actuator's units; clamped to its range as MuJoCo does.
         surroundings: mocap bodies during the step.
-        solver: 'newton', a fixed number of Newton steps (`contact.newton`), or 'mjx', MJX's own solver to convergence.
+        solver: 'newton', ours (`contact.newton`), or 'mjx', MJX's own, run to convergence.
 
     Returns:
         The state after the step; its reverse-mode derivative is exact wherever no contact starts or ends.
@@ -215,7 +215,7 @@ def _solution(world: World, problem: contact.ContactProblem, start: Array, solve
     """A converged solution without derivative."""
     problem, start = lax.stop_gradient((problem, start))
     if solver == "newton":
-        return contact.newton(problem, start)
+        return contact.newton(problem, start)[0]
     if solver == "mjx":
         return _mjx_solution(world.free, problem, start)
     raise UsageError(f"solver '{solver}' is not one of newton, mjx")

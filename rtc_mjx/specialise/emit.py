@@ -24,7 +24,7 @@ from rtc_mjx.specialise.graph import ELEMENTWISE, Graph, Node
 Mode = Literal["kernel", "vector"]
 KERNEL_OPERATIONS = 1800  # XLA's emitters split a computation of 2,000 and compute shared parts again and again
 KERNEL_SLOTS = 115  # LLVM gives up telling 250 memory locations apart, and with it vectorising
-PER_SLOT = 6  # operations of the reduction itself for each value that goes in or out
+PER_SLOT = 4  # operations of the reduction itself for each value that goes in or out
 IDENTITY, RESULT = -1, 2  # tags, beside 0 and 1 of the two elements
 Values = dict[Node, Any]
 

@@ -104,25 +104,39 @@ def compress(
         expand: from that vector to the result; traced inside the next function it restores constants and equalities.
     """
     program, structure = trace(function, *examples)
-    graph, flat = program.graph, program.output_nodes
-    distinct = [n for n in dict.fromkeys(flat) if not graph.is_constant(n)]
-    place = {n: i for i, n in enumerate(distinct)}
-    dtypes = {graph.dtypes[n] for n in distinct}
+    graph = program.graph
+    passed = _fewest(graph, program.output_nodes)
+    dtypes = {graph.dtypes[n] for n in passed}
     if len(dtypes) > 1:
         raise UsageError(f"results of one type are needed to pack them, got {sorted(str(d) for d in dtypes)}")
 
     def expand(vector: jax.Array) -> Any:
-        arrays = []
-        for nodes in program.outputs:
-            known = [graph.values[int(n)] if graph.is_constant(int(n)) else 0 for n in nodes.flat]
-            places = np.array([place.get(int(n), -1) for n in nodes.flat], np.int64)
-            base = jnp.asarray(np.array(known).reshape(nodes.shape), vector.dtype).reshape(-1)
-            moving = np.flatnonzero(places >= 0)
-            arrays.append(base.at[moving].set(vector[places[moving]]).reshape(nodes.shape) if moving.size else base.reshape(nodes.shape))
-        return jax.tree.unflatten(structure, arrays)
+        given = dict(zip(passed, _scalars([vector]), strict=True))
+        values = emit.evaluate(graph, given, program.output_nodes, "vector")
+        return jax.tree.unflatten(structure, _pack(graph, values, program.outputs))
 
-    packed = Program(graph, program.inputs, (np.array(distinct, np.int64),))
+    packed = Program(graph, program.inputs, (np.array(passed, np.int64),))
     return wrap(packed, jax.tree.structure(0), jax.tree.structure(examples), mode), expand
+
+
+def _fewest(graph: Graph, outputs: Sequence[Node]) -> list[Node]:
+    """Few nodes from which the outputs follow: an operand shared by several outputs may stand for them (n + t, n - t, n)."""
+    passed = dict.fromkeys(n for n in outputs if not graph.is_constant(n))
+
+    def implied(extra: Sequence[Node]) -> list[Node]:
+        have = {*passed, *extra}
+        return [n for n in passed if graph.args[n] and all(a in have or graph.is_constant(a) for a in graph.args[n])]
+
+    for candidate in sorted({a for n in passed for a in graph.args[n]} - set(passed)):
+        if graph.is_constant(candidate) or graph.ops[candidate] in ("native", "result"):
+            continue
+        if len(gone := implied([candidate])) >= 2:
+            for node in gone:
+                del passed[node]
+            passed[candidate] = None
+    for node in implied([]):
+        del passed[node]
+    return list(passed)
 
 
 def trace(function: Callable[..., Any], *examples: Any) -> tuple[Program, Any]:
