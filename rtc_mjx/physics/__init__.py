@@ -1,5 +1,6 @@
 """Worlds written in MJCF, stepped by MuJoCo MJX and differentiated exactly, contacts included."""
 
+from rtc_mjx.physics.fast import specialised_step
 from rtc_mjx.physics.rollout import check_inputs, simulate
 from rtc_mjx.physics.step import (
     PhysicsState,
@@ -14,5 +15,6 @@ from rtc_mjx.physics.world import World, asset_names, assets, from_spec, load
 
 __all__ = [
     "PhysicsState", "Surroundings", "World", "asset_names", "assets", "check_inputs", "constraint_rows",
-    "contact_problem", "from_spec", "load", "rest_state", "rest_surroundings", "simulate", "step",
+    "contact_problem", "from_spec", "load", "rest_state", "rest_surroundings", "simulate",
+    "specialised_step", "step",
 ]  # fmt: skip

@@ -60,25 +60,28 @@ class _Interpreter:
             inner = params[INLINED[name]]
             closed = inner if hasattr(inner, "consts") else core.ClosedJaxpr(inner, ())
             return self.run(closed.jaxpr, closed.consts, inputs)
-        if not equation.effects and name != "name" and all(self.known(x) for x in inputs):
-            return self.evaluated(equation, inputs)
-        rule = getattr(self, "unroll_" + name.replace("-", "_"), None)
-        result = None
-        if name in ELEMENTWISE:
-            result = self.each(lambda *a: self.graph.apply(name, *a), *inputs)
-        elif name in moves.MOVES and len(equation.outvars) == 1:
-            result = moves.MOVES[name](*inputs, **params)
-        elif name in REDUCTIONS:
-            result = self.reduce(inputs[0], REDUCTIONS[name], params["axes"])
-        elif name in CUMULATIVES:
-            result = self.cumulative(inputs[0], CUMULATIVES[name], params["axis"], params["reverse"])
-        elif name in SCATTERS:
-            result = self.scatter(SCATTERS[name], inputs, params)
-        elif rule is not None:
-            result = rule(equation, inputs)
+        result = self.unrolled(equation, inputs)
+        if result is None and not equation.effects and all(self.known(x) for x in inputs):
+            result = self.evaluated(equation, inputs)
         if result is None:
-            return self.natively(equation, inputs)
+            result = self.natively(equation, inputs)
         return list(result) if isinstance(result, (list, tuple)) else [result]
+
+    def unrolled(self, equation: Any, inputs: list[Nodes]) -> Nodes | list[Nodes] | None:
+        """The results where a rule applies; constants fold as the nodes are made."""
+        name, params = equation.primitive.name, equation.params
+        rule = getattr(self, "unroll_" + name.replace("-", "_"), None)
+        if name in ELEMENTWISE:
+            return self.each(lambda *a: self.graph.apply(name, *a), *inputs)
+        if name in moves.MOVES and len(equation.outvars) == 1:
+            return moves.MOVES[name](*inputs, **params)
+        if name in REDUCTIONS:
+            return self.reduce(inputs[0], REDUCTIONS[name], params["axes"])
+        if name in CUMULATIVES:
+            return self.cumulative(inputs[0], CUMULATIVES[name], params["axis"], params["reverse"])
+        if name in SCATTERS:
+            return self.scatter(SCATTERS[name], inputs, params)
+        return None if rule is None else rule(equation, inputs)
 
     def known(self, nodes: Nodes) -> bool:
         """Whether every element is a constant."""
@@ -89,6 +92,7 @@ class _Interpreter:
         return np.array([self.graph.values[int(n)] for n in nodes.flat]).reshape(nodes.shape)
 
     def packed(self, nodes: Nodes, aval: Any) -> np.ndarray:
+        """The values of constant nodes, in the type of the array they stand for."""
         return self.numbers(nodes).astype(aval.dtype).reshape(aval.shape)
 
     def each(self, function: Callable[..., Node], *arrays: Nodes) -> Nodes:
@@ -98,15 +102,9 @@ class _Interpreter:
         return np.array(nodes, np.int64).reshape(arrays[0].shape)
 
     def evaluated(self, equation: Any, inputs: list[Nodes]) -> list[Nodes]:
-        """An equation on constants: moves and arithmetic here, the rest by JAX."""
-        name, params = equation.primitive.name, equation.params
+        """An equation on constants, evaluated by JAX."""
+        params = equation.params
         values = [self.packed(x, a.aval) for x, a in zip(inputs, equation.invars, strict=True)]
-        if name in moves.MOVES and len(equation.outvars) == 1:
-            return [moves.MOVES[name](*inputs, **params)]
-        if name in ELEMENTWISE:
-            return [self.each(lambda *a: self.graph.apply(name, *a), *inputs)]
-        if name in ("select_n", "gather", "split", "convert_element_type") and (out := getattr(self, "unroll_" + name)(equation, inputs)) is not None:
-            return out if isinstance(out, list) else [out]
         with jax.ensure_compile_time_eval():
             out = equation.primitive.bind(*(jax.numpy.asarray(v) for v in values), **params)
         out = out if equation.primitive.multiple_results else [out]

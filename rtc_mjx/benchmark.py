@@ -1,0 +1,308 @@
+"""Physics, side by side in one process: MJX as it comes, ours plain, ours specialised, and hand-written equations.
+
+Variants are timed in turn, round by round, so that a slow moment of the machine meets all of them; medians are reported. A
+rollout starts from random states, with road users close enough that some worlds collide; the gradient is that of the last
+positions with respect to all controls.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+from mujoco import mjx
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from rtc_mjx import cli, compilation_cache, pile_up
+from rtc_mjx.errors import UsageError
+from rtc_mjx.physics import PhysicsState, Surroundings, World, load, rest_state, rest_surroundings, simulate, specialised_step
+
+WORLDS: dict[str, Callable[[], World]] = {
+    "point_mass": lambda: load("double_goal"),
+    "car": lambda: load("driving", road_users=0),
+    "car_8": lambda: load("driving", road_users=8),
+}
+VARIANTS = ("native", "plain", "specialised", "handwritten")
+DIRECTIONS = ("forward", "gradient")
+BATCHES = (16, 64, 256, 1024, 4096)
+STEPS = 32  # physics steps of a rollout
+MEMORY_LIMIT_MB = 6000.0  # rows that would need more are left out, and say so
+WHEELBASE = 2.8  # m, of the bicycle model
+
+Inputs = tuple[PhysicsState, Float[Array, "batch steps controls"], Surroundings]
+Rollout = Callable[[PhysicsState, Array, Surroundings], Array]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measurement; `steps_per_s` is None where it did not fit into memory."""
+
+    world: str
+    batch: int
+    variant: str
+    direction: str
+    steps_per_s: float | None
+    compile_s: float
+    temp_mb: float
+
+
+def random_inputs(world: World, batch: int, steps: int, seed: int = 0) -> Inputs:
+    """Random states, controls and surroundings: cars at 3 to 9 m/s with road users 2 to 12 m away, all over the field."""
+    random = np.random.default_rng(seed)
+    nv, users = world.mj.nv, len(world.mocap_ids)
+    qpos, qvel = 0.3 * random.standard_normal((batch, nv)), 0.3 * random.standard_normal((batch, nv))
+    if nv == 4:
+        heading, speed = random.uniform(-np.pi, np.pi, batch), random.uniform(3, 9, batch)
+        qpos[:, 2], qvel[:, 0], qvel[:, 1] = heading, speed * np.cos(heading), speed * np.sin(heading)
+    distance, bearing = random.uniform(2, 12, (batch, users)), random.uniform(-np.pi, np.pi, (batch, users))
+    place = np.stack([distance * np.cos(bearing), distance * np.sin(bearing), random.uniform(-np.pi, np.pi, (batch, users))], axis=2)
+    warm = rest_state(world).warmstart.size
+    state = PhysicsState(*(jnp.asarray(x, jnp.float32) for x in (qpos, qvel, np.zeros((batch, warm)))))
+    controls = jnp.asarray(random.uniform(-0.5, 0.5, (batch, steps, len(world.control_ids))), jnp.float32)
+    size = jnp.broadcast_to(rest_surroundings(world).size, (batch, users, 2))
+    return state, controls, Surroundings(jnp.asarray(place, jnp.float32), size)
+
+
+def native_rollout(world: World) -> Rollout:
+    """`mjx.step` as it comes, with `mjx.Data` carried, and iterations = 1: the only setting that reverse-differentiates."""
+    model = mjx.put_model(world.mj, impl="jax")
+    model = model.tree_replace({"opt.iterations": 1})
+    template, heights = mjx.make_data(world.mj, impl="jax"), world.mj.body_pos[list(world.mocap_ids), 2]
+
+    def rollout(state: PhysicsState, controls: Array, around: Surroundings) -> Array:
+        x, y, heading = around.pose.T
+        zero = jnp.zeros_like(x)
+        data = template.replace(
+            qpos=state.qpos,
+            qvel=state.qvel,
+            mocap_pos=jnp.stack([x, y, zero + heights], axis=1),
+            mocap_quat=jnp.stack([jnp.cos(heading / 2), zero, zero, jnp.sin(heading / 2)], axis=1),
+        )
+        ids = np.array(world.control_ids, int)
+
+        def body(data: mjx.Data, control: Array) -> tuple[mjx.Data, None]:
+            return mjx.step(model, data.replace(ctrl=data.ctrl.at[ids].set(control))), None
+
+        return lax.scan(body, data, controls)[0].qpos
+
+    return rollout
+
+
+def our_rollout(world: World, specialised: bool) -> Rollout:
+    """Our step, plain or specialised."""
+    one_step = specialised_step(world) if specialised else None
+    return lambda state, controls, around: simulate(world, state, controls, around, one_step=one_step)[0].qpos
+
+
+def handwritten_rollout(world: World) -> Rollout | None:
+    """The floor: a damped point mass, or a kinematic bicycle, in plain JAX; None where there is no such thing."""
+    h = world.timestep
+
+    def point_mass(carry: tuple[Array, Array], force: Array) -> tuple[tuple[Array, Array], None]:
+        position, velocity = carry
+        velocity = (velocity + h * 6.0 * jnp.clip(force, -1, 1)) / (1 + 2.0 * h)
+        return (position + h * velocity, velocity), None
+
+    def bicycle(carry: tuple[Array, Array], control: Array) -> tuple[tuple[Array, Array], None]:
+        pose, speed = carry
+        speed = speed + h * jnp.clip(control[0], -8.829, 4)
+        turn = speed * jnp.tan(jnp.clip(control[1], -0.6, 0.6)) / WHEELBASE
+        return (pose + h * jnp.stack([speed * jnp.cos(pose[2]), speed * jnp.sin(pose[2]), turn]), speed), None
+
+    if world.mj.nv == 2:
+        return lambda state, controls, _: lax.scan(point_mass, (state.qpos, state.qvel), controls)[0][0]
+    if world.users:
+        return None
+    return lambda state, controls, _: lax.scan(bicycle, (state.qpos[:3], state.qvel[0]), controls)[0][0]
+
+
+def rollouts(world: World) -> dict[str, Rollout]:
+    """All variants of a world."""
+    made = {
+        "native": native_rollout(world),
+        "plain": our_rollout(world, specialised=False),
+        "specialised": our_rollout(world, specialised=True),
+        "handwritten": handwritten_rollout(world),
+    }
+    return {name: rollout for name, rollout in made.items() if rollout is not None}
+
+
+def program(rollout: Rollout, direction: str) -> Callable[..., Array]:
+    """The batched function that is timed."""
+    batched = jax.vmap(rollout)
+    if direction == "forward":
+        return batched
+    return lambda state, controls, around: jax.grad(lambda u: jnp.sum(batched(state, u, around)))(controls)
+
+
+def measure(world_name: str, world: World, batch: int, direction: str, rounds: int, variants: Sequence[str] = VARIANTS) -> list[Row]:
+    """Compiles every variant, then times them in turn."""
+    inputs = random_inputs(world, batch, STEPS)
+    compiled, compile_s, temp_mb = {}, {}, {}
+    for name, rollout in rollouts(world).items():
+        if name not in variants:
+            continue
+        start = time.perf_counter()
+        compiled[name] = jax.jit(program(rollout, direction)).lower(*inputs).compile()
+        compile_s[name] = time.perf_counter() - start
+        temp_mb[name] = compiled[name].memory_analysis().temp_size_in_bytes / 1e6
+    fits = [name for name in compiled if temp_mb[name] <= MEMORY_LIMIT_MB]
+    times: dict[str, list[float]] = {name: [] for name in fits}
+    for turn in range(rounds + 1):
+        for name in fits:
+            start = time.perf_counter()
+            jax.block_until_ready(compiled[name](*inputs))
+            if turn:  # the first warms up
+                times[name].append(time.perf_counter() - start)
+    rate = {name: batch * STEPS / float(np.median(times[name])) for name in fits}
+    return [Row(world_name, batch, name, direction, rate.get(name), compile_s[name], temp_mb[name]) for name in compiled]
+
+
+def first_result_seconds(world_name: str) -> float:
+    """From calling for a specialised step to the first gradient of a batch of 64, in a process that finds a warm cache."""
+    seconds = 0.0
+    with tempfile.TemporaryDirectory() as folder:
+        for _ in range(2):  # the first fills the cache
+            command = [sys.executable, "-m", "rtc_mjx.benchmark", "--first-result", world_name]
+            done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "JAX_COMPILATION_CACHE_DIR": folder}, check=True)
+            seconds = float(done.stdout.split()[-1])
+    return seconds
+
+
+def _first_result(world_name: str) -> float:
+    compilation_cache.enable()
+    world = WORLDS[world_name]()
+    inputs = random_inputs(world, 64, STEPS)
+    start = time.perf_counter()
+    jax.block_until_ready(jax.jit(program(our_rollout(world, specialised=True), "gradient"))(*inputs))
+    return time.perf_counter() - start
+
+
+def table(rows: Sequence[Row]) -> Table:
+    """Rows with ratios to native, for the terminal."""
+    native = {(r.world, r.batch, r.direction): r for r in rows if r.variant == "native"}
+    out = Table(title=f"Physics steps a second (rollouts of {STEPS} steps)")
+    for column in ("world", "batch", "direction", "variant", "steps/s", "x native", "compile s", "x native", "temp MB"):
+        out.add_column(column, justify="left" if column in ("world", "direction", "variant") else "right")
+    for row in rows:
+        base = native.get((row.world, row.batch, row.direction))
+        speed = f"{row.steps_per_s:,.0f}" if row.steps_per_s else "no memory"
+        faster = f"{row.steps_per_s / base.steps_per_s:.1f}" if base and row.steps_per_s and base.steps_per_s else "-"
+        compiles = f"{row.compile_s / base.compile_s:.2f}" if base else "-"
+        cells = (row.world, row.batch, row.direction, row.variant, speed, faster, f"{row.compile_s:.1f}", compiles, f"{row.temp_mb:.1f}")
+        out.add_row(*map(str, cells), end_section=row.variant == rows[-1].variant)
+    return out
+
+
+def figure(rows: Sequence[Row], path: Path) -> None:
+    """Throughput against batch size, one panel a world and direction."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    worlds = list(dict.fromkeys(r.world for r in rows))
+    canvas, axes = pyplot.subplots(2, len(worlds), figsize=(3.6 * len(worlds), 5.6), sharex=True, squeeze=False)
+    for (i, direction), (j, world) in ((a, b) for a in enumerate(DIRECTIONS) for b in enumerate(worlds)):
+        for variant in VARIANTS:
+            chosen = [r for r in rows if (r.world, r.direction, r.variant) == (world, direction, variant) and r.steps_per_s]
+            if chosen:
+                axes[i][j].loglog([r.batch for r in chosen], [r.steps_per_s for r in chosen], "o-", label=variant)
+        axes[i][j].set_title(f"{world}, {direction}")
+        axes[i][j].grid(alpha=0.3)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("physics steps / s")
+    for axis in axes[-1]:
+        axis.set_xlabel("batch")
+    axes[0][0].legend(frameon=False)
+    canvas.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    canvas.savefig(path, dpi=150)
+    pyplot.close(canvas)
+
+
+def arguments() -> argparse.ArgumentParser:
+    """The command's options."""
+    parser = cli.Parser(prog="python -m rtc_mjx.benchmark", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="batch 64 only, three rounds; under three minutes on two cores")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all rows as JSON")
+    parser.add_argument("--figure", type=Path, metavar="FILE.png", help="draw throughput against batch size")
+    parser.add_argument("--worlds", default=",".join(WORLDS), help="comma-separated, of %(default)s")
+    parser.add_argument("--batches", default=",".join(map(str, BATCHES)), help="comma-separated batch sizes (default %(default)s)")
+    parser.add_argument("--rounds", type=int, default=7, help="timed rounds, of which the median counts (default %(default)s)")
+    parser.add_argument("--first-result", metavar="WORLD", help=argparse.SUPPRESS)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Runs the benchmark."""
+    options = arguments().parse_args(argv)
+    if options.first_result:
+        sys.stdout.write(f"{_first_result(options.first_result)}\n")
+        return
+    names, batches = _names(options.worlds), [64] if options.quick else _batches(options.batches)
+    if options.rounds < 1:
+        raise UsageError(f"--rounds {options.rounds}: at least 1 is needed")
+    for path in (options.json, options.figure):
+        if path is not None and not path.absolute().parent.is_dir():
+            raise UsageError(f"{path}: there is no folder {path.absolute().parent}")
+    jax.config.update("jax_enable_compilation_cache", False)  # compile times are measured
+    rounds = 3 if options.quick else options.rounds
+    console, rows = Console(), []
+    with Progress(console=console, transient=True) as progress:
+        task = progress.add_task("benchmark", total=len(names) * len(batches) * len(DIRECTIONS) + 1)
+        for name in names:
+            world = WORLDS[name]()
+            for batch, direction in ((b, d) for b in batches for d in DIRECTIONS):
+                progress.update(task, description=f"{name}, batch {batch}, {direction}")
+                rows += measure(name, world, batch, direction, rounds)
+                progress.advance(task)
+        progress.update(task, description="pile-up")
+        errors = pile_up.compare()
+        progress.advance(task)
+    console.print(table(rows))
+    console.print(pile_up.table(errors))
+    warm = {} if options.quick else {name: first_result_seconds(name) for name in names}
+    for name, seconds in warm.items():
+        console.print(f"{name}: first gradient {seconds:.1f} s after the call, with a warm compilation cache")
+    if options.json:
+        report = {"rows": [vars(r) for r in rows], "pile_up": errors, "update": [], "warm_first_result_s": warm}
+        options.json.write_text(json.dumps(report, indent=1))
+    if options.figure:
+        figure(rows, options.figure)
+
+
+def _names(text: str) -> list[str]:
+    names = text.split(",")
+    unknown = [n for n in names if n not in WORLDS]
+    if unknown:
+        raise UsageError(f"--worlds: no world '{unknown[0]}'; there are {', '.join(WORLDS)}")
+    return names
+
+
+def _batches(text: str) -> list[int]:
+    try:
+        batches = [int(b) for b in text.split(",")]
+    except ValueError:
+        batches = []
+    if not batches or min(batches) < 1:
+        raise UsageError(f"--batches {text}: positive whole numbers are needed, such as 16,64")
+    return batches
+
+
+if __name__ == "__main__":
+    cli.run(main)

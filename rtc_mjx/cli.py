@@ -1,0 +1,28 @@
+"""Command lines: one line for wrong use and exit status 2; 1 for failures; nothing swallowed."""
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from typing import NoReturn
+
+from rtc_mjx.errors import UsageError
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Prints the message and leaves with status 2."""
+        self.exit(2, f"{self.prog}: {message} (see --help)\n")
+
+
+def run(main: Callable[[Sequence[str] | None], None]) -> None:
+    """Runs a command's main function and turns `UsageError` into one line and status 2."""
+    try:
+        main(None)
+    except UsageError as error:
+        sys.stderr.write(f"{error}\n")
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted\n")
+        sys.exit(1)
