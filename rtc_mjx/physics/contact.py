@@ -11,7 +11,6 @@ it as one Newton correction around a solution that the differentiator takes as c
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -19,14 +18,15 @@ from jax import lax
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
 
+from rtc_mjx.pytree import pytree
+
 SOLUTION = "contact_solution"  # what a checkpoint policy keeps, so that a backward pass need not solve again
 MAX_ITERATIONS = 32  # Newton steps; contact between cars takes 1 to 3, the worst of 10,000 random pile-ups took 11
 LINE_SEARCH_ITERATIONS = 2
 TOLERANCE = 1000  # in units of machine precision: by how much a row may end on the wrong side
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Rows:
     """One-sided constraint rows (contacts and joint limits): J, D and a of the module docstring."""
 
@@ -35,8 +35,7 @@ class Rows:
     reference: Float[Array, "rows"]
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class ContactProblem:
     """What the solver sees: mass matrix (kg, kg m, kg m^2), smooth force (N, N m) and the constraint rows."""
 
@@ -121,7 +120,7 @@ def _excess(problem: ContactProblem, acceleration: Float[Array, "nv"]) -> Float[
     return problem.rows.jacobian @ acceleration - problem.rows.reference
 
 
-def _hessian(problem: ContactProblem, active: Float[Array, "rows"]) -> Float[Array, "nv nv"]:
+def _hessian(problem: ContactProblem, active: Bool[Array, "rows"]) -> Float[Array, "nv nv"]:
     weight = jnp.where(active, problem.rows.stiffness, 0)
     return problem.mass + (problem.rows.jacobian.T * weight) @ problem.rows.jacobian
 

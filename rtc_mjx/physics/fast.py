@@ -35,7 +35,6 @@ from rtc_mjx.physics.world import World
 from rtc_mjx.specialise import Mode, compress, specialise
 
 
-@functools.lru_cache(maxsize=16)
 def specialised_step(world: World, mode: Mode | None = None) -> OneStep:
     """Returns `step` of this world, specialised: (state, control, surroundings) -> state.
 
@@ -47,6 +46,12 @@ def specialised_step(world: World, mode: Mode | None = None) -> OneStep:
         A function to vmap over worlds, scan over time and differentiate in reverse mode. Inside `jax.checkpoint` with a policy
         that keeps `contact.SOLUTION`, a backward pass does not solve the contact problem again (`simulate` does this).
     """
+    return _specialised_step(world, mode, jax.config.jax_enable_x64)
+
+
+@functools.lru_cache(maxsize=16)
+def _specialised_step(world: World, mode: Mode | None, x64: bool) -> OneStep:
+    del x64  # part of the key: programs are folded in one precision
     state, control = rest_state(world), jnp.zeros(len(world.control_ids))
     terms, as_terms = compress(lambda s, c: dynamics(world, s, c), state, control, mode=mode)
     packed = jax.eval_shape(terms, state, control)

@@ -9,7 +9,6 @@ contributes no velocity derivative to the implicit integrator, as in C MuJoCo an
 sideways would stop too late). Only the state travels from step to step; the rest of `mjx.Data` is rebuilt.
 """
 
-from dataclasses import dataclass
 from typing import Literal
 
 import jax
@@ -23,14 +22,14 @@ from mujoco import mjx
 from rtc_mjx.errors import UsageError
 from rtc_mjx.physics import contact
 from rtc_mjx.physics.world import Part, World
+from rtc_mjx.pytree import pytree
 
 Solver = Literal["newton", "mjx"]
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class PhysicsState:
-    """What one step hands to the next.
+    """What one step hands to the next; leading axes are batch or time.
 
     Attributes:
         qpos: joint positions, m and rad.
@@ -38,13 +37,12 @@ class PhysicsState:
         warmstart: the last acceleration, where the contact solver starts, m/s^2 and rad/s^2; empty without contacts.
     """
 
-    qpos: Float[Array, "nv"]
-    qvel: Float[Array, "nv"]
-    warmstart: Float[Array, "warm"]
+    qpos: Float[Array, "*batch nv"]
+    qvel: Float[Array, "*batch nv"]
+    warmstart: Float[Array, "*batch warm"]
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Surroundings:
     """Bodies moved from outside (goals, replayed road users) during one step.
 
@@ -53,12 +51,11 @@ class Surroundings:
         size: length and width in m of each; ignored for bodies that do not collide.
     """
 
-    pose: Float[Array, "users 3"]
-    size: Float[Array, "users 2"]
+    pose: Float[Array, "*batch users 3"]
+    size: Float[Array, "*batch users 2"]
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@pytree
 class Dynamics:
     """What a state and a control determine without the road users.
 

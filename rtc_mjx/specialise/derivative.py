@@ -11,7 +11,7 @@ import numpy as np
 
 from rtc_mjx.specialise.graph import Graph, Native, Node
 
-CONSTANT = {"const", "hold", "saved", "sign", "floor", "ceil"}  # what the derivative holds fixed
+CONSTANT = {"const", "hold", "sign", "floor", "ceil"}  # what the derivative holds fixed
 
 
 def adjoint(graph: Graph, outputs: Sequence[Node], seeds: Sequence[Node | None], wanted: Sequence[Node]) -> list[Node]:
@@ -137,8 +137,9 @@ def _extremum(g: Graph, node: Node, args: tuple[Node, ...], seed: Node, give: Gi
 def _pow(g: Graph, node: Node, args: tuple[Node, ...], seed: Node, give: Give) -> None:
     base, power = args
     one, zero = g.constant(1, g.dtypes[base]), g.constant(0, g.dtypes[base])
-    slope = g.apply("mul", power, g.apply("pow", base, g.apply("sub", power, one)))
-    give(base, g.apply("mul", seed, g.select(g.apply("eq", power, zero), zero, slope)))
+    less = g.apply("sub", power, g.constant(1, g.dtypes[power]))  # the power may be an integer
+    slope = g.apply("mul", g.convert(power, g.dtypes[base]), g.apply("pow", base, less))
+    give(base, g.apply("mul", seed, g.select(g.apply("eq", power, g.constant(0, g.dtypes[power])), zero, slope)))
     positive = g.select(g.apply("gt", base, zero), base, one)
     give(power, g.apply("mul", seed, g.apply("mul", node, g.apply("log", positive))))
 
@@ -195,6 +196,7 @@ def _one_minus_square(g: Graph, x: Node, op: str = "sub") -> Node:
 _RULES: dict[str, Rule] = {
     "add": _linear_add, "sub": _linear_sub, "mul": _mul, "div": _div, "rem": _rem, "max": _extremum, "min": _extremum,
     "pow": _pow, "atan2": _atan2, "select": _select, "convert": _convert, "sqrt": _root,
+    "saved": lambda g, node, args, seed, give: give(args[0], seed),
     "neg": lambda g, node, args, seed, give: give(args[0], g.apply("neg", seed)),
     "abs": _unary(lambda g, x, y: g.apply("sign", x)),
     "sin": _unary(lambda g, x, y: g.apply("cos", x)),

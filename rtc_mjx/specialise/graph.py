@@ -123,10 +123,10 @@ class Graph:
 
     def hold(self, node: Node) -> Node:
         """The same value, taken as constant by the derivative (stop_gradient)."""
-        return node if self.ops[node] in ("const", "hold", "saved") else self.add("hold", (node,), self.dtypes[node])
+        return node if self.ops[node] in ("const", "hold") else self.add("hold", (node,), self.dtypes[node])
 
     def save(self, node: Node) -> Node:
-        """The same value, kept for the backward pass; constant for the derivative, as what it is made of is held."""
+        """The same value, kept for the backward pass (checkpoint_name)."""
         return node if self.is_constant(node) else self.add("saved", (node,), self.dtypes[node])
 
     def sum(self, nodes: Sequence[Node], dtype: Any) -> Node:

@@ -34,6 +34,19 @@ def constants(graph: Graph, value: Any) -> Nodes:
     return np.array(nodes, np.int64).reshape(value.shape)
 
 
+def _out_of_bounds(dtype: np.dtype) -> Any:
+    """What JAX reads outside an array: NaN, the smallest signed or the largest unsigned number, True."""
+    if dtype == bool or np.issubdtype(dtype, np.inexact):
+        return True if dtype == bool else np.nan
+    limits = np.iinfo(dtype)
+    return limits.min if limits.min < 0 else limits.max
+
+
+def _applies_function(update: core.Jaxpr | None) -> bool:
+    """Whether a scatter combines old and new by more than taking the new (`.at[].apply`)."""
+    return update is not None and (bool(update.eqns) or update.outvars[0] is not update.invars[1])
+
+
 class _Interpreter:
     """Walks equations; methods are named after what they unroll."""
 
@@ -106,7 +119,7 @@ class _Interpreter:
         params = equation.params
         values = [self.packed(x, a.aval) for x, a in zip(inputs, equation.invars, strict=True)]
         with jax.ensure_compile_time_eval():
-            out = equation.primitive.bind(*(jax.numpy.asarray(v) for v in values), **params)
+            out = equation.primitive.bind(*(jax.numpy.asarray(v) for v in values), **equation.primitive.get_bind_params(params))
         out = out if equation.primitive.multiple_results else [out]
         return [constants(self.graph, v) for v in out]
 
@@ -115,7 +128,7 @@ class _Interpreter:
         primitive, params = equation.primitive, equation.params
 
         def function(*arrays: Any) -> Sequence[Any]:
-            out = primitive.bind(*arrays, **params)
+            out = primitive.bind(*arrays, **primitive.get_bind_params(params))  # custom derivatives bind functions, not jaxprs
             return tuple(out) if primitive.multiple_results else (out,)
 
         takes = tuple((a.aval.shape, np.dtype(a.aval.dtype)) for a in equation.invars)
@@ -132,7 +145,7 @@ class _Interpreter:
     def reduce(self, x: Nodes, op: str, axes: Sequence[int]) -> Nodes | None:
         """A reduction over axes."""
         kept = [d for d in range(x.ndim) if d not in axes]
-        rows = np.transpose(x, [*kept, *axes]).reshape([*(x.shape[d] for d in kept), -1])
+        rows = np.transpose(x, [*kept, *axes]).reshape([*(x.shape[d] for d in kept), math.prod(x.shape[d] for d in axes)])
         if rows.shape[-1] == 0:
             return None
         out = [self.fold(op, [int(n) for n in rows[i]]) for i in np.ndindex(*rows.shape[:-1])]
@@ -149,7 +162,7 @@ class _Interpreter:
     def scatter(self, op: str | None, inputs: list[Nodes], params: dict[str, Any]) -> Nodes | None:
         """A scatter with known indices."""
         x, indices, updates = inputs
-        if not self.known(indices):
+        if not self.known(indices) or (op is None and _applies_function(params["update_jaxpr"])):
             return None
         combine = (lambda old, new: new) if op is None else (lambda old, new: self.graph.apply(op, old, new))
         wanted = {k: params[k] for k in ("dimension_numbers", "mode")}
@@ -162,7 +175,7 @@ class _Interpreter:
         out, params = equation.outvars[0].aval, equation.params
         fill = params["fill_value"]
         if fill is None:
-            fill = np.nan if np.issubdtype(out.dtype, np.inexact) else np.iinfo(out.dtype).min if out.dtype != bool else True
+            fill = _out_of_bounds(out.dtype)
         filler = self.graph.constant(fill, out.dtype)
         wanted = {k: params[k] for k in ("dimension_numbers", "slice_sizes", "mode")}
         return moves.gather(x, self.numbers(indices).astype(np.int64), filler, out.shape, **wanted)

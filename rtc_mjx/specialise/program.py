@@ -26,11 +26,13 @@ class Program:
         graph: where the nodes live; adjoints are added to it.
         inputs: shape and type of each input array, in order; scalars are numbered through.
         outputs: nodes of each output array.
+        types: type of each output array; an empty one has no node to tell it.
     """
 
     graph: Graph
     inputs: tuple[Shape, ...]
     outputs: tuple[np.ndarray, ...]
+    types: tuple[np.dtype, ...]
 
     @functools.cached_property
     def input_nodes(self) -> list[Node]:
@@ -113,9 +115,10 @@ def compress(
     def expand(vector: jax.Array) -> Any:
         given = dict(zip(passed, _scalars([vector]), strict=True))
         values = emit.evaluate(graph, given, program.output_nodes, "vector")
-        return jax.tree.unflatten(structure, _pack(graph, values, program.outputs))
+        return jax.tree.unflatten(structure, _pack(values, program.outputs, program.types))
 
-    packed = Program(graph, program.inputs, (np.array(passed, np.int64),))
+    dtype = dtypes.pop() if dtypes else jax.dtypes.canonicalize_dtype(float)
+    packed = Program(graph, program.inputs, (np.array(passed, np.int64),), (dtype,))
     return wrap(packed, jax.tree.structure(0), jax.tree.structure(examples), mode), expand
 
 
@@ -151,7 +154,8 @@ def trace(function: Callable[..., Any], *examples: Any) -> tuple[Program, Any]:
         nodes.append(np.array(scalars, np.int64).reshape(leaf.shape))
         count += size
     outputs = interpret.trace_into(graph, jaxpr, nodes)
-    program = Program(graph, tuple((x.shape, np.dtype(x.dtype)) for x in leaves), tuple(outputs))
+    types = tuple(np.dtype(x.dtype) for x in jax.tree.leaves(shapes))
+    program = Program(graph, tuple((x.shape, np.dtype(x.dtype)) for x in leaves), tuple(outputs), types)
     return program, jax.tree.structure(shapes)
 
 
@@ -175,7 +179,7 @@ def _call(program: Program, mode: emit.Mode) -> Callable[..., tuple[jax.Array, .
         given = dict(zip(program.input_nodes, _scalars(arrays), strict=True))
         values = emit.evaluate(program.graph, given, [*program.output_nodes, *extra], mode)
         count = len(program.output_nodes)
-        return _pack(program.graph, values[:count], program.outputs), values[count:]
+        return _pack(values[:count], program.outputs, program.types), values[count:]
 
     @jax.custom_vjp
     def call(*arrays: jax.Array) -> tuple[jax.Array, ...]:
@@ -228,9 +232,8 @@ def _stack(scalars: Sequence[Any], shape: tuple[int, ...], dtype: Any) -> jax.Ar
     return jnp.stack([jnp.asarray(x, dtype) for x in scalars]).reshape(shape) if scalars else jnp.zeros(shape, dtype)
 
 
-def _pack(graph: Graph, values: Sequence[Any], outputs: Sequence[np.ndarray]) -> tuple[jax.Array, ...]:
+def _pack(values: Sequence[Any], outputs: Sequence[np.ndarray], types: Sequence[np.dtype]) -> tuple[jax.Array, ...]:
     ends = np.cumsum([0, *(a.size for a in outputs)])
     return tuple(
-        _stack(values[a:b], nodes.shape, graph.dtypes[int(nodes.flat[0])] if nodes.size else np.float32)
-        for a, b, nodes in zip(ends[:-1], ends[1:], outputs, strict=True)
+        _stack(values[a:b], nodes.shape, dtype) for a, b, nodes, dtype in zip(ends[:-1], ends[1:], outputs, types, strict=True)
     )

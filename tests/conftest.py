@@ -1,0 +1,18 @@
+"""Shared by all tests: shapes are checked at run time, and compiled programs are kept between runs."""
+
+import jax
+import pytest
+from jaxtyping import install_import_hook
+
+install_import_hook("rtc_mjx.physics", "beartype.beartype")  # before anything of the package is imported
+
+from rtc_mjx import compilation_cache  # noqa: E402
+
+compilation_cache.enable()
+
+
+@pytest.fixture
+def x64():
+    """Double precision inside one test."""
+    with jax.enable_x64(True):
+        yield
