@@ -17,7 +17,7 @@ def pytree(cls: type[T]) -> type[T]:
     that shape checks look at what people construct and not at what JAX passes through.
     """
     frozen = dataclasses.dataclass(frozen=True)(cls)
-    names = [f.name for f in dataclasses.fields(frozen)]
+    names = [f.name for f in dataclasses.fields(frozen)]  # type: ignore[arg-type]  # T is any class until it is frozen
 
     def flatten(value: Any) -> tuple[list[tuple[jax.tree_util.GetAttrKey, Any]], None]:
         return [(jax.tree_util.GetAttrKey(n), getattr(value, n)) for n in names], None

@@ -7,7 +7,17 @@ import pytest
 from worlds import TOUCHING, WORLDS, draw, make
 
 from rtc_mjx import pile_up
-from rtc_mjx.physics import PhysicsState, Surroundings, contact_problem, load, rest_state, rest_surroundings, simulate, specialised_step, step
+from rtc_mjx.physics import (
+    PhysicsState,
+    Surroundings,
+    contact_problem,
+    load,
+    rest_state,
+    rest_surroundings,
+    simulate,
+    specialised_step,
+    step,
+)
 
 pytestmark = pytest.mark.usefixtures("x64")
 STATES = 100
@@ -29,8 +39,6 @@ def scalar_of(world, one_step):
 def active_rows(world, *arguments):
     """Which rows the solution pushes with, as bits: where they differ within a difference's step, there is a kink."""
     problem = contact_problem(world, *arguments)
-    from rtc_mjx.physics import contact
-
     solution = contact.newton(problem, contact.solve(problem.mass, problem.force))[0]
     return (contact.violation(problem, solution) < 0) & (jnp.sum(jnp.abs(problem.rows.jacobian), axis=1) > 0)
 
@@ -40,7 +48,7 @@ def active_rows(world, *arguments):
 def test_gradient_equals_central_differences(name, variant):
     world = make(name)
     value = scalar_of(world, VARIANTS[variant](world))
-    inputs = draw(world, STATES, seed=11, spread=2.2)
+    inputs = draw(world, STATES, seed=11)
     inputs.qvel[:5] = 0  # at v = 0
     state, control, around = inputs.arguments(world)
     flat = jnp.concatenate([state.qpos, state.qvel], axis=1)
@@ -49,10 +57,13 @@ def test_gradient_equals_central_differences(name, variant):
     def batched(flat, control, pose):
         return jax.vmap(value)(flat, control, Surroundings(pose, around.size), state.warmstart)
 
-    gradients = jax.jit(jax.grad(lambda *x: jnp.sum(batched(*x)), argnums=(0, 1, 2)))(*parts)
     random, evaluate = np.random.default_rng(0), jax.jit(batched)
     directions = [jnp.asarray(random.standard_normal(x.shape)) for x in parts]
-    analytic = sum(jnp.sum((g * d).reshape(STATES, -1), axis=1) for g, d in zip(gradients, directions, strict=True))
+    if variant == "specialised":
+        gradients = jax.jit(jax.grad(lambda *x: jnp.sum(batched(*x)), argnums=(0, 1, 2)))(*parts)
+        analytic = sum(jnp.sum((g * d).reshape(STATES, -1), axis=1) for g, d in zip(gradients, directions, strict=True))
+    else:  # forward mode compiles in a tenth of the time; reverse mode of the plain step is tested in the pile-up
+        analytic = jax.jit(lambda *x: jax.jvp(batched, x, tuple(directions))[1])(*parts)
 
     def difference(h):
         up, down = (evaluate(*(x + s * h * d for x, d in zip(parts, directions, strict=True))) for s in (1, -1))
@@ -61,7 +72,9 @@ def test_gradient_equals_central_differences(name, variant):
     rows = jax.jit(jax.vmap(lambda f, u, p, z, w: active_rows(world, PhysicsState(*jnp.split(f, 2), w), u, Surroundings(p, z))))
     smooth, touched = np.ones(STATES, bool), np.zeros(STATES, bool)
     if name in TOUCHING:
-        here, *there = (rows(*(x + s * 2e-5 * d for x, d in zip(parts, directions, strict=True)), around.size, state.warmstart) for s in (0, 1, -1))
+        here, *there = (
+            rows(*(x + s * 2e-5 * d for x, d in zip(parts, directions, strict=True)), around.size, state.warmstart) for s in (0, 1, -1)
+        )
         smooth = np.all([np.all(here == t, axis=1) for t in there], axis=0)
         touched = np.any(here, axis=1)
         assert np.mean(touched) >= 0.5
@@ -71,7 +84,7 @@ def test_gradient_equals_central_differences(name, variant):
     error = np.abs(np.asarray(analytic) - best) / np.maximum(np.abs(best), 1.0)
     limited = np.asarray(error > 1e-5)
     assert np.max(np.where(smooth, error, 0)) <= 1e-5, f"{np.sum(limited & smooth)} states of {STATES}"
-    assert np.all(np.isfinite(np.concatenate([np.ravel(g) for g in gradients])))
+    assert np.all(np.isfinite(analytic))
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

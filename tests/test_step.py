@@ -30,16 +30,17 @@ def c_trajectory(world, inputs, index, controls):
 @pytest.mark.parametrize("solver", ["newton", "mjx"])
 def test_trajectory_matches_c_mujoco(name, solver):
     world = make(name)
-    inputs = draw(world, 4, seed=1, spread=6.0)
+    inputs = draw(world, 3, seed=1, gap=(0.3, 1.5))
     controls = np.random.default_rng(2).uniform(-1, 1, (200, len(world.control_ids)))
     seen = 0
     run = jax.jit(lambda s, u, a: simulate(world, s, u, a, one_step=lambda *x: step(world, *x, solver=solver))[1])
-    for index in range(4):
+    for index in range(3):
         state, _, around = inputs.arguments(world, index)
         ours = run(state, jnp.asarray(controls), around)
         truth, contacts = c_trajectory(world, inputs, index, controls)
         seen += contacts
-        assert np.max(np.abs(np.c_[ours.qpos, ours.qvel] - truth)) < 1e-8
+        # MJX adds 1e-6 to a denominator when it looks for the closest points of two capsules; cars that touch feel it
+        assert np.max(np.abs(np.c_[ours.qpos, ours.qvel] - truth)) < (1e-6 if name in TOUCHING else 1e-9)
     assert seen > 0 or name not in TOUCHING
 
 
@@ -92,7 +93,7 @@ def test_newton_reaches_the_solution_that_mjx_converges_to(name):
 def test_newton_converges_in_single_precision_too():
     with jax.enable_x64(False):
         world = load("driving", cars=2, road_users=2)
-        inputs = draw(world, 300, seed=5, spread=2.5)
+        inputs = draw(world, 300, seed=5)
         arguments = jax.tree.map(lambda x: x.astype(jnp.float32), inputs.arguments(world))
         problems = jax.jit(jax.vmap(lambda *x: contact_problem(world, *x)))(*arguments)
         solutions, converged = jax.jit(jax.vmap(lambda p: contact.newton(p, contact.solve(p.mass, p.force))))(problems)

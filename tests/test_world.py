@@ -66,7 +66,12 @@ def test_unknown_worlds_and_names_are_answered_with_what_there_is():
     with pytest.raises(UsageError, match="missing.xml"):
         load("/nowhere/missing.xml")
     world = load("driving")
-    for ask, wanted in ((world.joint, "car0/steering"), (world.site, "car0/rear_axle"), (world.body, "car0/chassis"), (world.control, "car0/drive")):
+    for ask, wanted in (
+        (world.joint, "car0/steering"),
+        (world.site, "car0/rear_axle"),
+        (world.body, "car0/chassis"),
+        (world.control, "car0/drive"),
+    ):
         with pytest.raises(UsageError, match=f"'wheel'.*{wanted}"):
             ask("wheel")
 
@@ -86,7 +91,9 @@ def test_cars_and_road_users_are_copied(cars, users):
     assert np.allclose(world.default_sizes, [4.6, 1.9])
 
 
-@pytest.mark.parametrize(("options", "named"), [({"road_users": -1}, "road_users=-1"), ({"cars": 0}, "cars=0"), ({"cars": 10_000}, "cars=10000")])
+@pytest.mark.parametrize(
+    ("options", "named"), [({"road_users": -1}, "road_users=-1"), ({"cars": 0}, "cars=0"), ({"cars": 10_000}, "cars=10000")]
+)
 def test_impossible_numbers_of_copies_are_refused(options, named):
     with pytest.raises(UsageError, match=named):
         load("driving", **options)

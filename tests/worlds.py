@@ -47,17 +47,66 @@ class Inputs:
         return state, pick(self.control), Surroundings(pick(self.pose), pick(self.size))
 
 
-def draw(world: World, count: int, seed: int = 0, spread: float = 3.0) -> Inputs:
-    """Random inputs; `spread` in m is small enough that most worlds with several bodies have contacts."""
+def draw(world: World, count: int, seed: int = 0, gap: tuple[float, float] = (-0.25, 0.15), speed: float = 6.0) -> Inputs:
+    """Random inputs in which bodies nearly touch.
+
+    Cars and road users stand around the first car at random bearings and headings, `gap` metres off (negative: pressed
+    in). Deeper overlaps, with axes crossing, do not happen on a road, and MJX and C differ there by design of MJX.
+    """
     random = np.random.default_rng(seed)
     nv, users, nu = world.mj.nv, len(world.mocap_ids), len(world.control_ids)
-    scale = np.tile([spread, spread, 1.5, 0.3], nv // 4) if nv % 4 == 0 else np.ones(nv)
-    qpos = random.standard_normal((count, nv)) * scale
-    qvel = random.standard_normal((count, nv)) * (np.tile([6, 3, 1, 0.5], nv // 4) if nv % 4 == 0 else 1.0)
     control = random.uniform(-0.5, 0.5, (count, nu))
-    pose = random.standard_normal((count, users, 3)) * [spread, spread, 2]
     size = np.broadcast_to(np.asarray(rest_surroundings(world).size), (count, users, 2)) * random.uniform(0.8, 1.2, (count, users, 2))
-    return Inputs(qpos, qvel, control, pose, size)
+    if nv % 4:
+        pose = random.standard_normal((count, users, 3))
+        return Inputs(random.standard_normal((count, nv)), random.standard_normal((count, nv)), control, pose, size)
+    cars = nv // 4
+    qpos, pose = np.zeros((count, cars, 4)), np.zeros((count, users, 3))
+    qpos[..., 2], qpos[..., 3] = random.uniform(-3, 3, (count, cars)), random.uniform(-0.4, 0.4, (count, cars))
+    qpos[:, 0, :2] = random.standard_normal((count, 2))
+    for i in range(count):
+        others = [(qpos[i, k], np.array([4.6, 1.9])) for k in range(1, cars)] + [(pose[i, k], size[i, k]) for k in range(users)]
+        first = random.uniform(-np.pi, np.pi)
+        for k, (where, extent) in enumerate(others):
+            where[2] = random.uniform(-3, 3)
+            bearing = first + 2 * np.pi * k / max(len(others), 1) + random.uniform(-0.3, 0.3)
+            where[:2] = beside(qpos[i, 0, :3], where[2], extent, bearing, random.uniform(*gap))
+    qvel = random.standard_normal((count, cars, 4)) * [speed, speed / 2, 1, 0.5]
+    return Inputs(qpos.reshape(count, nv), qvel.reshape(count, nv), control, pose, size)
+
+
+def beside(car: np.ndarray, heading: float, size: np.ndarray, bearing: float, gap: float) -> np.ndarray:
+    """Where a vehicle stands that is `gap` from the car in the direction of `bearing`; found by bisection."""
+    toward, near, far = np.array([np.cos(bearing), np.sin(bearing)]), 0.0, 20.0
+    own = axis(car[:2], car[2], np.array([4.6, 1.9]))
+    for _ in range(60):
+        middle = (near + far) / 2
+        other = axis(car[:2] + middle * toward, heading, size)
+        clear = distance(own, other) - 0.95 - min(size) / 2
+        near, far = (middle, far) if clear < gap else (near, middle)
+    return car[:2] + far * toward
+
+
+def axis(centre: np.ndarray, heading: float, size: np.ndarray) -> np.ndarray:
+    """End points of a capsule's axis."""
+    half = max(size[0] - size[1], 0) / 2 * np.array([np.cos(heading), np.sin(heading)])
+    return np.array([centre - half, centre + half])
+
+
+def distance(one: np.ndarray, two: np.ndarray) -> float:
+    """Between two segments in the plane; 0 where they cross."""
+
+    def side(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> float:
+        return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+    def to_point(segment: np.ndarray, point: np.ndarray) -> float:
+        along = segment[1] - segment[0]
+        share = np.clip((point - segment[0]) @ along / max(along @ along, 1e-12), 0, 1)
+        return float(np.linalg.norm(segment[0] + share * along - point))
+
+    if side(*one, two[0]) * side(*one, two[1]) < 0 and side(*two, one[0]) * side(*two, one[1]) < 0:
+        return 0.0
+    return min([to_point(one, p) for p in two] + [to_point(two, p) for p in one])
 
 
 def c_data(world: World, inputs: Inputs, index: int) -> tuple[mujoco.MjModel, mujoco.MjData]:

@@ -10,6 +10,7 @@ solution is a smooth function of (M, f, J, D, a) whose derivative is one linear 
 it as one Newton correction around a solution that the differentiator takes as constant, so any converged solver will do.
 """
 
+import functools
 from collections.abc import Callable
 
 import jax
@@ -72,13 +73,13 @@ def exact(problem: ContactProblem, solution: Float[Array, "nv"]) -> Float[Array,
         q* - H^-1 r(q*), where only r's own dependence on the problem is differentiated (module docstring).
     """
     solution = checkpoint_name(lax.stop_gradient(solution), SOLUTION)
-    hessian = lax.stop_gradient(_hessian(problem, _excess(problem, solution) < 0))  # H is held fixed: r(q*) = 0, so its derivative drops out
+    hessian = lax.stop_gradient(
+        _hessian(problem, _excess(problem, solution) < 0)
+    )  # H is held fixed: r(q*) = 0, so its derivative drops out
     return solution - solve(hessian, residual(problem, solution))
 
 
-def newton(
-    problem: ContactProblem | None, start: Float[Array, "nv"], one: Callable[..., tuple[Array, Array]] | None = None
-) -> tuple[Float[Array, "nv"], Bool[Array, ""]]:
+def newton(problem: ContactProblem, start: Float[Array, "nv"]) -> tuple[Float[Array, "nv"], Bool[Array, ""]]:
     """Minimises the contact cost by safeguarded Newton steps until the active set is the solution's.
 
     The cost is piecewise quadratic, so a full step that leaves the active set as it was ends at the minimum, to rounding.
@@ -86,12 +87,15 @@ def newton(
     Args:
         problem: the contact problem; no derivative is taken here (see `exact`).
         start: where to begin, such as the previous step's solution, m/s^2 and rad/s^2.
-        one: `newton_step` with the problem filled in, such as a specialised one; None for the plain one.
 
     Returns:
         The minimiser, and whether it was reached within `MAX_ITERATIONS`.
     """
-    advance = one or (lambda q: newton_step(problem, q))
+    return iterate(functools.partial(newton_step, problem), start)
+
+
+def iterate(advance: Callable[[Array], tuple[Array, Array]], start: Float[Array, "nv"]) -> tuple[Float[Array, "nv"], Bool[Array, ""]]:
+    """Repeats a Newton step (`newton_step` with its problem filled in) until it says that it is done."""
 
     def body(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         acceleration, done = advance(carry[0])

@@ -7,7 +7,6 @@ world, the two pyramid edges along z) is handed to the next as such, not as data
 
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,12 +25,12 @@ from rtc_mjx.physics.step import (
     constraint_rows,
     dynamics,
     finish,
-    integrate,
     one_user_rows,
     rest_state,
     rest_surroundings,
+    step,
 )
-from rtc_mjx.physics.world import World
+from rtc_mjx.physics.world import Part, World, double_precision
 from rtc_mjx.specialise import Mode, compress, specialise
 
 
@@ -46,19 +45,19 @@ def specialised_step(world: World, mode: Mode | None = None) -> OneStep:
         A function to vmap over worlds, scan over time and differentiate in reverse mode. Inside `jax.checkpoint` with a policy
         that keeps `contact.SOLUTION`, a backward pass does not solve the contact problem again (`simulate` does this).
     """
-    return _specialised_step(world, mode, jax.config.jax_enable_x64)
+    return _specialised_step(world, mode, double_precision())
 
 
 @functools.lru_cache(maxsize=16)
 def _specialised_step(world: World, mode: Mode | None, x64: bool) -> OneStep:
     del x64  # part of the key: programs are folded in one precision
     state, control = rest_state(world), jnp.zeros(len(world.control_ids))
+    if not constraint_rows(world):
+        whole = specialise(lambda s, c: step(world, s, c, rest_surroundings(world)), state, control, mode=mode)
+        return lambda s, c, _: whole(s, c)
     terms, as_terms = compress(lambda s, c: dynamics(world, s, c), state, control, mode=mode)
     packed = jax.eval_shape(terms, state, control)
-    if not constraint_rows(world):
-        last = specialise(lambda s, t: _free_flight(world, s, as_terms(t)), state, packed, mode=mode)
-        return lambda s, c, _: last(s, terms(s, c))
-    rows, as_rows, users = _rows_stage(world, state, mode)
+    as_rows, users = _rows_stage(world, state, mode)
 
     def problem(terms_vector: Array, rows_vectors: Array) -> tuple[Dynamics, contact.ContactProblem]:
         parts = [as_rows(rows_vectors[i]) for i in range(len(world.users))] or [_no_rows(world)]
@@ -78,31 +77,31 @@ def _specialised_step(world: World, mode: Mode | None, x64: bool) -> OneStep:
     def one_step(s: PhysicsState, c: Array, around: Surroundings) -> PhysicsState:
         free, touching = terms(s, c), users(s, around)
         start, held, near = lax.stop_gradient((s.warmstart, free, touching))  # the derivative is implicit: see contact.exact
-        solution, _ = contact.newton(None, start, lambda q: advance(q, held, near))
+        solution, _ = contact.iterate(lambda q: advance(q, held, near), start)
         return last(s, free, touching, checkpoint_name(solution, contact.SOLUTION))
 
     return one_step
 
 
-def _rows_stage(world: World, state: PhysicsState, mode: Mode | None) -> tuple[Any, Callable[..., contact.Rows], Callable[..., Array]]:
-    """The rows of one user as a program, and that program over all users."""
+def _rows_stage(world: World, state: PhysicsState, mode: Mode | None) -> tuple[Callable[..., contact.Rows], Callable[..., Array]]:
+    """From one user's vector to its rows, and the program that gives the vectors of all users."""
     if not world.one_user:
-        return None, lambda vector: _no_rows(world), lambda s, around: jnp.zeros((0, 0), s.qpos.dtype)
+        return lambda vector: _no_rows(world), lambda s, around: jnp.zeros((0, 0), s.qpos.dtype)
     pose, size = jnp.zeros(3), jnp.zeros(2)
-    halve, restore = (_halved, _restored) if _is_flat_pyramid(world) else (lambda rows: rows, lambda rows: rows)
+    halve, restore = (_halved, _restored) if _is_flat_pyramid(world.one_user) else (lambda rows: rows, lambda rows: rows)
     rows, expand = compress(lambda s, p, z: halve(one_user_rows(world, s, p, z)), state, pose, size, mode=mode)
     index = jnp.array(world.users, int)
 
     def over_users(s: PhysicsState, around: Surroundings) -> Array:
         return jax.vmap(rows, in_axes=(None, 0, 0))(s, around.pose[index], around.size[index])
 
-    return rows, lambda vector: restore(expand(vector)), over_users
+    return lambda vector: restore(expand(vector)), over_users
 
 
-def _is_flat_pyramid(world: World) -> bool:
+def _is_flat_pyramid(part: Part) -> bool:
     """Whether a user's rows are the pyramids of planar contacts with sliding friction, four rows each."""
-    contacts = world.one_user.mjx_data()._impl.contact
-    return world.one_user.planar and bool(np.all(np.asarray(contacts.dim) == 3))
+    contacts = part.mjx_data()._impl.contact
+    return part.planar and bool(np.all(np.asarray(contacts.dim) == 3))
 
 
 def _halved(rows: contact.Rows) -> dict[str, Array]:
@@ -131,7 +130,3 @@ def _restored(parts: dict[str, Array]) -> contact.Rows:
 
 def _no_rows(world: World) -> contact.Rows:
     return contact.Rows(jnp.zeros((0, world.mj.nv)), jnp.zeros(0), jnp.zeros(0))
-
-
-def _free_flight(world: World, state: PhysicsState, terms: Dynamics) -> PhysicsState:
-    return integrate(world, state, terms, terms.force, state.warmstart)

@@ -74,8 +74,8 @@ def check_inputs(world: World, state: PhysicsState, controls: Array, surrounding
     for name, value in named.items():
         if isinstance(value, jax.core.Tracer):
             continue  # inside a compiled program values are not known; what computes them is checked there
-        value = np.asarray(value)
-        bad = np.argwhere(~np.isfinite(value))
+        numbers = np.asarray(value)
+        bad = np.argwhere(~np.isfinite(numbers))
         if bad.size:
             index = tuple(int(i) for i in bad[0])
-            raise NonFiniteError(f"{name}{list(index)} is {value[index]} in world '{world.name}'; finite values are needed")
+            raise NonFiniteError(f"{name}{list(index)} is {numbers[index]} in world '{world.name}'; finite values are needed")

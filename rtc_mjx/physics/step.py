@@ -151,6 +151,8 @@ def user_rows(world: World, state: PhysicsState, surroundings: Surroundings) -> 
 def one_user_rows(world: World, state: PhysicsState, pose: Float[Array, "3"], size: Float[Array, "2"]) -> contact.Rows:
     """Contact rows between the free bodies and one road user at a pose, with a length and a width."""
     part = world.one_user
+    if part is None:
+        raise UsageError(f"world '{world.name}' has no road users")
     radius, half = 0.5 * jnp.minimum(size[0], size[1]), 0.5 * jnp.maximum(size[0] - size[1], 0)
     model = part.mjx_model()
     capsule = jnp.stack([radius, half, jnp.zeros_like(half)])
@@ -222,19 +224,18 @@ def _mjx_solution(part: Part, problem: contact.ContactProblem, start: Array) -> 
     """MJX's solver, handed our rows through the `mjx.Data` it reads."""
     model, data, rows = part.dense.mjx_model(), part.dense.mjx_data(), problem.rows
     nothing = jnp.zeros_like(rows.stiffness)
-    data = data.replace(
-        qfrc_smooth=problem.force, qacc_smooth=contact.solve(problem.mass, problem.force), qacc_warmstart=start
-    )
+    data = data.replace(qfrc_smooth=problem.force, qacc_smooth=contact.solve(problem.mass, problem.force), qacc_warmstart=start)
     factor = jax.scipy.linalg.cho_factor(problem.mass)[0]
     data = data.tree_replace({
         "_impl.M": problem.mass, "_impl.qLD": factor, "_impl.efc_J": rows.jacobian, "_impl.efc_D": rows.stiffness,
-        "_impl.efc_aref": rows.reference, "_impl.nefc": rows.reference.shape[0], "_impl.efc_frictionloss": nothing, "_impl.efc_force": nothing,
+        "_impl.efc_aref": rows.reference, "_impl.efc_frictionloss": nothing, "_impl.efc_force": nothing,
+        "_impl.nefc": rows.reference.shape[0],
     })  # fmt: skip
     return mjx.solve(model, data).qacc
 
 
 def _velocity_derivative(mj: mujoco.MjModel, model: mjx.Model, data: mjx.Data) -> Float[Array, "nv nv"]:
-    """d force / d velocity as the integrator uses it: joint damping, and for implicitfast the actuators not clamped."""
+    """D force / d velocity as the integrator uses it: joint damping, and for implicitfast the actuators not clamped."""
     damping = jnp.diag(-jnp.asarray(model.dof_damping))
     if mj.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER:
         off = mj.opt.disableflags & (mujoco.mjtDisableBit.mjDSBL_EULERDAMP | mujoco.mjtDisableBit.mjDSBL_DAMPER)

@@ -27,6 +27,11 @@ COLLIDABLE = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
 JOINTS = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
 
 
+def double_precision() -> bool:
+    """Whether JAX computes in double precision at the call."""
+    return jax.dtypes.canonicalize_dtype(np.float64) == np.float64
+
+
 @dataclass(frozen=True, eq=False)
 class Part:
     """One compiled model of a world: the free bodies alone, or with one road user.
@@ -47,11 +52,11 @@ class Part:
 
     def mjx_model(self) -> mjx.Model:
         """The model on the device, in the precision that JAX is set to at the call."""
-        return _mjx_model(self, jax.config.jax_enable_x64)
+        return _mjx_model(self, double_precision())
 
     def mjx_data(self) -> mjx.Data:
         """A template `mjx.Data`; the step rebuilds everything but the state from it."""
-        return _mjx_data(self, jax.config.jax_enable_x64)
+        return _mjx_data(self, double_precision())
 
     @functools.cached_property
     def rows(self) -> int:
@@ -247,8 +252,17 @@ def check_supported(model: mujoco.MjModel, name: str) -> None:
         *_elements(model, mujoco.mjtObj.mjOBJ_TENDON, np.ones(model.ntendon, bool), "tendon"),
         *_elements(model, mujoco.mjtObj.mjOBJ_FLEX, np.ones(model.nflex, bool), "flex"),
         *_elements(model, mujoco.mjtObj.mjOBJ_GEOM, _uncovered_geoms(model), "colliding geom that is neither sphere nor capsule"),
-        *_elements(model, mujoco.mjtObj.mjOBJ_ACTUATOR, _uncovered_actuators(model), "actuator with state or of a muscle, user or servo-to-site kind"),
-        *([f"fluid forces (density {model.opt.density}, viscosity {model.opt.viscosity})"] if model.opt.density or model.opt.viscosity else []),
+        *_elements(
+            model,
+            mujoco.mjtObj.mjOBJ_ACTUATOR,
+            _uncovered_actuators(model),
+            "actuator with state or of a muscle, user or servo-to-site kind",
+        ),
+        *(
+            [f"fluid forces (density {model.opt.density}, viscosity {model.opt.viscosity})"]
+            if model.opt.density or model.opt.viscosity
+            else []
+        ),
     ]
     if bad:
         raise UnsupportedWorldError(f"world '{name}' is outside what the differentiable step covers: {'; '.join(bad)}")

@@ -6,6 +6,6 @@ emits it (`emit`). The result is an ordinary JAX function: jit, vmap, scan and r
 """
 
 from rtc_mjx.specialise.emit import Mode, default_mode
-from rtc_mjx.specialise.program import Program, compress, specialise
+from rtc_mjx.specialise.program import Program, Specialised, compress, specialise
 
-__all__ = ["Mode", "Program", "compress", "default_mode", "specialise"]
+__all__ = ["Mode", "Program", "Specialised", "compress", "default_mode", "specialise"]

@@ -91,7 +91,7 @@ class Graph:
         dtype = np.dtype(bool) if op in PREDICATES else self.dtypes[args[0]]
         if all(self.ops[a] == "const" for a in args):
             with np.errstate(all="ignore"):
-                if op == "not" and dtype != bool:
+                if op == "not" and dtype.kind != "b":
                     return self.constant(np.invert(self.values[args[0]]), dtype)
                 return self.constant(function(*(self.values[a] for a in args)), dtype)
         folded = _IDENTITIES[op](self, *args) if op in _IDENTITIES else None
@@ -107,7 +107,7 @@ class Graph:
             return if_true if self.values[predicate] else if_false
         if if_true == if_false:
             return if_true
-        if self.dtypes[if_true] == bool and self.is_constant(if_true) and self.is_constant(if_false):
+        if self.dtypes[if_true].kind == "b" and self.is_constant(if_true) and self.is_constant(if_false):
             return predicate if self.values[if_true] else self.apply("not", predicate)
         if self.ops[predicate] == "not":
             return self.select(self.args[predicate][0], if_false, if_true)
@@ -232,7 +232,7 @@ def _bound(worst: float) -> Callable[[Graph, Node, Node], Node | None]:
 
 def _junction(neutral: bool) -> Callable[[Graph, Node, Node], Node | None]:
     def fold(g: Graph, x: Node, y: Node) -> Node | None:
-        if g.dtypes[x] != bool:
+        if g.dtypes[x].kind != "b":
             return None
         for a, b in ((x, y), (y, x)):
             if g.is_constant(a):

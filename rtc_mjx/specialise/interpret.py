@@ -16,7 +16,14 @@ from rtc_mjx.specialise import moves
 from rtc_mjx.specialise.graph import ELEMENTWISE, Graph, Native, Node
 
 Nodes = np.ndarray
-INLINED = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "core_call": "call_jaxpr", "checkpoint": "jaxpr", "remat2": "jaxpr"}
+INLINED = {
+    "jit": "jaxpr",
+    "pjit": "jaxpr",
+    "closed_call": "call_jaxpr",
+    "core_call": "call_jaxpr",
+    "checkpoint": "jaxpr",
+    "remat2": "jaxpr",
+}
 SCATTERS = {"scatter": None, "scatter-add": "add", "scatter-mul": "mul", "scatter-min": "min", "scatter-max": "max"}
 REDUCTIONS = {"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min", "reduce_and": "and", "reduce_or": "or"}
 CUMULATIVES = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
@@ -36,8 +43,8 @@ def constants(graph: Graph, value: Any) -> Nodes:
 
 def _out_of_bounds(dtype: np.dtype) -> Any:
     """What JAX reads outside an array: NaN, the smallest signed or the largest unsigned number, True."""
-    if dtype == bool or np.issubdtype(dtype, np.inexact):
-        return True if dtype == bool else np.nan
+    if dtype.kind == "b" or np.issubdtype(dtype, np.inexact):
+        return True if dtype.kind == "b" else np.nan
     limits = np.iinfo(dtype)
     return limits.min if limits.min < 0 else limits.max
 
@@ -59,7 +66,9 @@ class _Interpreter:
         held.update(zip(jaxpr.invars, inputs, strict=True))
 
         def read(atom: Any) -> Nodes:
-            return constants(self.graph, np.asarray(atom.val, atom.aval.dtype)) if isinstance(atom, core.Literal) else held[atom]
+            if isinstance(atom, core.Literal):
+                return constants(self.graph, np.asarray(atom.val, getattr(atom.aval, "dtype", None)))
+            return held[atom]
 
         for equation in jaxpr.eqns:
             results = self.equation(equation, [read(a) for a in equation.invars])
@@ -199,7 +208,7 @@ class _Interpreter:
 
     def unroll_select_n(self, equation: Any, inputs: list[Nodes]) -> Nodes | None:
         which, *cases = inputs
-        if len(cases) != 2 or equation.invars[0].aval.dtype != bool:
+        if len(cases) != 2 or equation.invars[0].aval.dtype.kind != "b":
             return None
         return self.each(self.graph.select, which, cases[1], cases[0])
 
@@ -285,7 +294,8 @@ class _Interpreter:
         order = range(n) if lower else range(n - 1, -1, -1)
         for place in np.ndindex(*b.shape[:-2], b.shape[-1]):
             *group, column = place
-            matrix, solved = a[tuple(group)], []
+            matrix = a[tuple(group)]
+            solved: list[int] = []
             for i in order:
                 taken = g.sum([g.apply("mul", int(matrix[i, k]), int(out[(*group, k, column)])) for k in solved], g.dtypes[int(b.flat[0])])
                 rest = g.apply("sub", int(b[(*group, i, column)]), taken)

@@ -88,10 +88,10 @@ def gather(x: Nodes, numbers: np.ndarray, filler: int, out_shape: Sequence[int],
     for place in np.ndindex(*out_shape):
         group = tuple(place[i] for i in batch)
         start = _starts(numbers, group, x.ndim, d.start_index_map, d.operand_batching_dims, d.start_indices_batching_dims)
-        start = _placed(start, room, mode)
-        if start is not None:
-            start[window] += np.array([place[i] for i in d.offset_dims], np.int64)
-        out[place] = filler if start is None else x[tuple(start)]
+        placed = _placed(start, room, mode)
+        if placed is not None:
+            placed[window] += np.array([place[i] for i in d.offset_dims], np.int64)
+        out[place] = filler if placed is None else x[tuple(placed)]
     return out
 
 
@@ -107,11 +107,9 @@ def scatter(x: Nodes, numbers: np.ndarray, updates: Nodes, combine: Callable[[in
     out = np.array(x, np.int64)
     for place in np.ndindex(*updates.shape):
         group = tuple(place[i] for i in batch)
-        start = _starts(
-            numbers, group, x.ndim, d.scatter_dims_to_operand_dims, d.operand_batching_dims, d.scatter_indices_batching_dims
-        )
-        start = _placed(start, room, mode)
-        if start is not None:
-            start[window] += np.array([place[i] for i in d.update_window_dims], np.int64)
-            out[tuple(start)] = combine(int(out[tuple(start)]), int(updates[place]))
+        start = _starts(numbers, group, x.ndim, d.scatter_dims_to_operand_dims, d.operand_batching_dims, d.scatter_indices_batching_dims)
+        placed = _placed(start, room, mode)
+        if placed is not None:
+            placed[window] += np.array([place[i] for i in d.update_window_dims], np.int64)
+            out[tuple(placed)] = combine(int(out[tuple(placed)]), int(updates[place]))
     return out

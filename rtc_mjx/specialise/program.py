@@ -61,7 +61,9 @@ class Program:
         graph, nodes = self.graph, self.input_nodes
         count = len(nodes)
         floats = [np.issubdtype(graph.dtypes[n], np.inexact) for n in self.output_nodes]
-        seeds = [graph.input(count + i, graph.dtypes[n]) if f else None for i, (n, f) in enumerate(zip(self.output_nodes, floats, strict=True))]
+        seeds = [
+            graph.input(count + i, graph.dtypes[n]) if f else None for i, (n, f) in enumerate(zip(self.output_nodes, floats, strict=True))
+        ]
         ends = np.cumsum([int(np.prod(shape)) for shape, _ in self.inputs])
         groups = np.split(np.array(nodes, np.int64), ends[:-1])
         chosen = [int(n) for group, want in zip(groups, wanted, strict=True) if want for n in group]
@@ -80,7 +82,7 @@ class Backward:
     outputs: list[Node]
 
 
-def specialise(function: Callable[..., Any], *examples: Any, mode: emit.Mode | None = None) -> Callable[..., Any]:
+def specialise(function: Callable[..., Any], *examples: Any, mode: emit.Mode | None = None) -> Specialised:
     """Returns the same function of one world, folded and scalarised for the shapes and types of the examples.
 
     Args:
@@ -93,7 +95,7 @@ def specialise(function: Callable[..., Any], *examples: Any, mode: emit.Mode | N
         `program` is the `Program`.
     """
     program, structure = trace(function, *examples)
-    return wrap(program, structure, jax.tree.structure(examples), mode)
+    return Specialised(program, structure, jax.tree.structure(examples), mode)
 
 
 def compress(
@@ -119,7 +121,7 @@ def compress(
 
     dtype = dtypes.pop() if dtypes else jax.dtypes.canonicalize_dtype(float)
     packed = Program(graph, program.inputs, (np.array(passed, np.int64),), (dtype,))
-    return wrap(packed, jax.tree.structure(0), jax.tree.structure(examples), mode), expand
+    return Specialised(packed, jax.tree.structure(0), jax.tree.structure(examples), mode), expand
 
 
 def _fewest(graph: Graph, outputs: Sequence[Node]) -> list[Node]:
@@ -159,16 +161,27 @@ def trace(function: Callable[..., Any], *examples: Any) -> tuple[Program, Any]:
     return program, jax.tree.structure(shapes)
 
 
-def wrap(program: Program, structure: Any, arguments: Any, mode: emit.Mode | None) -> Callable[..., Any]:
-    """The program as a function of pytrees."""
+@dataclass(frozen=True, eq=False)
+class Specialised:
+    """A program as a function of pytrees.
 
-    def specialised(*inputs: Any) -> Any:
-        if jax.tree.structure(inputs) != arguments:
-            raise UsageError(f"specialised for arguments {arguments}, called with {jax.tree.structure(inputs)}")
-        return jax.tree.unflatten(structure, program(*jax.tree.leaves(inputs), mode=mode))
+    Attributes:
+        program: the folded arithmetic; `program.operations` says how much is left.
+        structure: of the result.
+        arguments: structure of the arguments.
+        mode: how it is emitted; None for what suits the device.
+    """
 
-    specialised.program = program
-    return specialised
+    program: Program
+    structure: Any
+    arguments: Any
+    mode: emit.Mode | None
+
+    def __call__(self, *inputs: Any) -> Any:
+        """Evaluates it; the arguments must have the structure, shapes and types it was specialised for."""
+        if jax.tree.structure(inputs) != self.arguments:
+            raise UsageError(f"specialised for arguments {self.arguments}, called with {jax.tree.structure(inputs)}")
+        return jax.tree.unflatten(self.structure, self.program(*jax.tree.leaves(inputs), mode=self.mode))
 
 
 @functools.lru_cache(maxsize=256)
@@ -234,6 +247,4 @@ def _stack(scalars: Sequence[Any], shape: tuple[int, ...], dtype: Any) -> jax.Ar
 
 def _pack(values: Sequence[Any], outputs: Sequence[np.ndarray], types: Sequence[np.dtype]) -> tuple[jax.Array, ...]:
     ends = np.cumsum([0, *(a.size for a in outputs)])
-    return tuple(
-        _stack(values[a:b], nodes.shape, dtype) for a, b, nodes, dtype in zip(ends[:-1], ends[1:], outputs, types, strict=True)
-    )
+    return tuple(_stack(values[a:b], nodes.shape, dtype) for a, b, nodes, dtype in zip(ends[:-1], ends[1:], outputs, types, strict=True))
