@@ -82,6 +82,29 @@ class Backward:
     outputs: list[Node]
 
 
+@dataclass(frozen=True, eq=False)
+class Specialised:
+    """A program as a function of pytrees.
+
+    Attributes:
+        program: the folded arithmetic; `program.operations` says how much is left.
+        structure: of the result.
+        arguments: structure of the arguments.
+        mode: how it is emitted; None for what suits the device.
+    """
+
+    program: Program
+    structure: Any
+    arguments: Any
+    mode: emit.Mode | None
+
+    def __call__(self, *inputs: Any) -> Any:
+        """Evaluates it; the arguments must have the structure, shapes and types it was specialised for."""
+        if jax.tree.structure(inputs) != self.arguments:
+            raise UsageError(f"specialised for arguments {self.arguments}, called with {jax.tree.structure(inputs)}")
+        return jax.tree.unflatten(self.structure, self.program(*jax.tree.leaves(inputs), mode=self.mode))
+
+
 def specialise(function: Callable[..., Any], *examples: Any, mode: emit.Mode | None = None) -> Specialised:
     """Returns the same function of one world, folded and scalarised for the shapes and types of the examples.
 
@@ -159,29 +182,6 @@ def trace(function: Callable[..., Any], *examples: Any) -> tuple[Program, Any]:
     types = tuple(np.dtype(x.dtype) for x in jax.tree.leaves(shapes))
     program = Program(graph, tuple((x.shape, np.dtype(x.dtype)) for x in leaves), tuple(outputs), types)
     return program, jax.tree.structure(shapes)
-
-
-@dataclass(frozen=True, eq=False)
-class Specialised:
-    """A program as a function of pytrees.
-
-    Attributes:
-        program: the folded arithmetic; `program.operations` says how much is left.
-        structure: of the result.
-        arguments: structure of the arguments.
-        mode: how it is emitted; None for what suits the device.
-    """
-
-    program: Program
-    structure: Any
-    arguments: Any
-    mode: emit.Mode | None
-
-    def __call__(self, *inputs: Any) -> Any:
-        """Evaluates it; the arguments must have the structure, shapes and types it was specialised for."""
-        if jax.tree.structure(inputs) != self.arguments:
-            raise UsageError(f"specialised for arguments {self.arguments}, called with {jax.tree.structure(inputs)}")
-        return jax.tree.unflatten(self.structure, self.program(*jax.tree.leaves(inputs), mode=self.mode))
 
 
 @functools.lru_cache(maxsize=256)

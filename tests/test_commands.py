@@ -1,0 +1,92 @@
+"""Commands: what they print, write and refuse."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rtc_mjx import benchmark
+from rtc_mjx.errors import UsageError
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def rows():
+    world = benchmark.WORLDS["point_mass"]()
+    return [r for d in benchmark.DIRECTIONS for r in benchmark.measure("point_mass", world, 16, d, rounds=1)]
+
+
+def test_every_variant_and_direction_is_measured(rows):
+    assert {(r.variant, r.direction) for r in rows} == {(v, d) for v in benchmark.VARIANTS for d in benchmark.DIRECTIONS}
+    assert all(r.steps_per_s > 0 and r.compile_s > 0 and r.temp_mb >= 0 for r in rows)
+
+
+def test_specialising_is_worth_it(rows):
+    """Far below what the benchmark measures, so that a busy machine does not fail it."""
+    rate = {(r.variant, r.direction): r.steps_per_s for r in rows}
+    assert rate["specialised", "gradient"] > 5 * rate["native", "gradient"]
+
+
+def test_the_figure_is_drawn(rows, tmp_path):
+    benchmark.figure(rows, tmp_path / "speed.png")
+    assert (tmp_path / "speed.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("name", benchmark.WORLDS)
+def test_hand_written_equations_do_what_the_world_does(name):
+    """The floor must be the same problem: a gently driven point mass or car ends where its equations say."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    world = benchmark.WORLDS[name]()
+    floor = benchmark.handwritten_rollout(world)
+    if floor is None:
+        assert world.users
+        return
+    state, controls, around = benchmark.random_inputs(world, 1, benchmark.STEPS)
+    state, controls, around = jax.tree.map(lambda x: x[0], (state, controls * 0.04, around))
+    if world.mj.nv == 4:
+        state = type(state)(jnp.zeros(4), jnp.array([5.0, 0, 0, 0]), state.warmstart)
+    ours = benchmark.our_rollout(world, specialised=False)(state, controls, around)
+    assert np.allclose(floor(state, controls, around)[:2], ours[:2], atol=0.02 * (1 + np.max(np.abs(ours))))
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (["--worlds", "moon"], "no world 'moon'.*point_mass, car, car_8"),
+        (["--batches", "16,x"], "--batches 16,x"),
+        (["--batches", "0"], "--batches 0"),
+        (["--rounds", "0"], "--rounds 0"),
+        (["--json", "/nowhere/at/all.json"], "/nowhere/at"),
+    ],
+)
+def test_wrong_options_are_refused_in_one_line(options, named):
+    with pytest.raises(UsageError, match=named):
+        benchmark.main(options)
+
+
+def test_wrong_use_leaves_with_status_2_and_one_line():
+    for options in (["--worlds", "moon"], ["--quik"]):
+        done = subprocess.run([sys.executable, "-m", "rtc_mjx.benchmark", *options], capture_output=True, text=True, cwd=ROOT, check=False)
+        assert done.returncode == 2
+        assert len(done.stderr.strip().splitlines()) == 1
+        assert options[-1] in done.stderr
+
+
+def test_help_explains_and_nothing_else_is_printed():
+    done = subprocess.run([sys.executable, "-m", "rtc_mjx.benchmark", "--help"], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert "--quick" in done.stdout and done.stderr == ""
+
+
+def test_rows_survive_json(rows):
+    assert json.loads(json.dumps([vars(r) for r in rows]))[0]["world"] == "point_mass"
+
+
+def test_the_lock_file_holds_versions_and_no_addresses():
+    lines = (ROOT / "requirements.lock").read_text().splitlines()
+    assert lines and not any("://" in line or "@" in line for line in lines)
