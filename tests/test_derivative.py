@@ -141,11 +141,12 @@ def test_memory_of_a_backward_pass_grows_by_little_more_than_the_state(name):
 def test_derivatives_by_sizes_and_initial_state_flow_through_a_rollout():
     world = load("driving", road_users=1)
     around = Surroundings(jnp.array([[6.0, 0.2, 0.1]]), jnp.array([[4.6, 1.9]]))
-    state = rest_state(world)
+    state, one_step = rest_state(world), specialised_step(world)
 
+    @jax.jit
     def end(speed, size):
         moving = PhysicsState(state.qpos, state.qvel.at[0].set(speed), state.warmstart)
-        return simulate(world, moving, jnp.zeros((20, 2)), Surroundings(around.pose, size))[0].qpos[0]
+        return simulate(world, moving, jnp.zeros((20, 2)), Surroundings(around.pose, size), one_step=one_step)[0].qpos[0]
 
     by_speed, by_size = jax.grad(end, argnums=(0, 1))(10.0, around.size)
     h = 1e-6

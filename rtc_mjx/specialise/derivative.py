@@ -182,6 +182,10 @@ def _inverse_of(slope: Callable[[Graph, Node, Node], Node]) -> Rule:
     return rule
 
 
+def _magnitude(g: Graph, node: Node, args: tuple[Node, ...], seed: Node, give: Give) -> None:
+    give(args[0], g.select(g.apply("ge", args[0], g.constant(0, g.dtypes[node])), seed, g.apply("neg", seed)))  # at 0 as JAX has it
+
+
 def _root(g: Graph, node: Node, args: tuple[Node, ...], seed: Node, give: Give) -> None:
     zero, half = g.constant(0, g.dtypes[node]), g.constant(0.5, g.dtypes[node])
     positive = g.apply("gt", node, zero)
@@ -198,7 +202,7 @@ _RULES: dict[str, Rule] = {
     "pow": _pow, "atan2": _atan2, "select": _select, "convert": _convert, "sqrt": _root,
     "saved": lambda g, node, args, seed, give: give(args[0], seed),
     "neg": lambda g, node, args, seed, give: give(args[0], g.apply("neg", seed)),
-    "abs": _unary(lambda g, x, y: g.apply("sign", x)),
+    "abs": _magnitude,
     "sin": _unary(lambda g, x, y: g.apply("cos", x)),
     "cos": _unary(lambda g, x, y: g.apply("neg", g.apply("sin", x))),
     "tan": _unary(lambda g, x, y: _one_minus_square(g, y, "add")),

@@ -232,8 +232,12 @@ class _Interpreter:
         return self.each(raised, inputs[0])
 
     def unroll_clamp(self, equation: Any, inputs: list[Nodes]) -> Nodes:
-        low, x, high = inputs
-        return self.each(lambda a, b, c: self.graph.apply("min", self.graph.apply("max", b, a), c), low, x, high)
+        g = self.graph
+
+        def clamped(low: Node, x: Node, high: Node) -> Node:  # selects, since at a bound JAX gives x no derivative
+            return g.select(g.apply("gt", x, low), g.select(g.apply("lt", x, high), x, high), g.apply("min", low, high))
+
+        return self.each(clamped, *inputs)
 
     def unroll_stop_gradient(self, equation: Any, inputs: list[Nodes]) -> Nodes:
         return self.each(self.graph.hold, inputs[0])

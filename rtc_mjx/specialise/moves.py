@@ -68,13 +68,11 @@ def _starts(numbers: np.ndarray, group: tuple[int, ...], rank: int, index_map: S
     return start
 
 
-def _placed(start: np.ndarray, room: np.ndarray, mode: GatherScatterMode) -> np.ndarray | None:
-    """The start after the out-of-bounds rule; None where the window is dropped."""
-    if mode == GatherScatterMode.CLIP:
+def _placed(start: np.ndarray, room: np.ndarray, clips: bool) -> np.ndarray | None:
+    """The start after the out-of-bounds rule: moved inside, or None where the window is dropped."""
+    if clips:
         return np.clip(start, 0, room)
-    if mode == GatherScatterMode.FILL_OR_DROP and (np.any(start < 0) or np.any(start > room)):
-        return None
-    return start
+    return None if np.any(start < 0) or np.any(start > room) else start
 
 
 def gather(x: Nodes, numbers: np.ndarray, filler: int, out_shape: Sequence[int], *, dimension_numbers: Any,
@@ -88,7 +86,7 @@ def gather(x: Nodes, numbers: np.ndarray, filler: int, out_shape: Sequence[int],
     for place in np.ndindex(*out_shape):
         group = tuple(place[i] for i in batch)
         start = _starts(numbers, group, x.ndim, d.start_index_map, d.operand_batching_dims, d.start_indices_batching_dims)
-        placed = _placed(start, room, mode)
+        placed = _placed(start, room, mode != GatherScatterMode.FILL_OR_DROP)  # XLA clips what is promised to be inside
         if placed is not None:
             placed[window] += np.array([place[i] for i in d.offset_dims], np.int64)
         out[place] = filler if placed is None else x[tuple(placed)]
@@ -108,7 +106,7 @@ def scatter(x: Nodes, numbers: np.ndarray, updates: Nodes, combine: Callable[[in
     for place in np.ndindex(*updates.shape):
         group = tuple(place[i] for i in batch)
         start = _starts(numbers, group, x.ndim, d.scatter_dims_to_operand_dims, d.operand_batching_dims, d.scatter_indices_batching_dims)
-        placed = _placed(start, room, mode)
+        placed = _placed(start, room, mode == GatherScatterMode.CLIP)  # XLA drops what is outside
         if placed is not None:
             placed[window] += np.array([place[i] for i in d.update_window_dims], np.int64)
             out[tuple(placed)] = combine(int(out[tuple(placed)]), int(updates[place]))

@@ -102,6 +102,9 @@ class Specialised:
         """Evaluates it; the arguments must have the structure, shapes and types it was specialised for."""
         if jax.tree.structure(inputs) != self.arguments:
             raise UsageError(f"specialised for arguments {self.arguments}, called with {jax.tree.structure(inputs)}")
+        for leaf, (shape, _) in zip(jax.tree.leaves(inputs), self.program.inputs, strict=True):
+            if np.shape(leaf) != shape:
+                raise UsageError(f"specialised for an array of shape {shape}, called with one of shape {np.shape(leaf)}; vmap adds axes")
         return jax.tree.unflatten(self.structure, self.program(*jax.tree.leaves(inputs), mode=self.mode))
 
 
@@ -153,10 +156,14 @@ def _fewest(graph: Graph, outputs: Sequence[Node]) -> list[Node]:
 
     def implied(extra: Sequence[Node]) -> list[Node]:
         have = {*passed, *extra}
-        return [n for n in passed if graph.args[n] and all(a in have or graph.is_constant(a) for a in graph.args[n])]
+        return [n for n in passed if pure(n) and all(a in have or graph.is_constant(a) for a in graph.args[n])]
 
+    def pure(node: Node) -> bool:  # what is held or saved must stay so, and no native operation is repeated
+        return bool(graph.args[node]) and graph.ops[node] not in ("hold", "saved", "native", "result")
+
+    types = {graph.dtypes[n] for n in passed}
     for candidate in sorted({a for n in passed for a in graph.args[n]} - set(passed)):
-        if graph.is_constant(candidate) or graph.ops[candidate] in ("native", "result"):
+        if graph.is_constant(candidate) or graph.ops[candidate] == "native" or graph.dtypes[candidate] not in types:
             continue
         if len(gone := implied([candidate])) >= 2:
             for node in gone:
