@@ -55,9 +55,10 @@ def _moving(graph: Graph, live: Sequence[Node], wanted: set[Node]) -> set[Node]:
     for node in live:
         if node in wanted:
             moving.add(node)
-        elif graph.ops[node] not in CONSTANT and any(a in moving for a in graph.args[node]):
-            if graph.ops[node] == "native" or np.issubdtype(graph.dtypes[node], np.inexact):
-                moving.add(node)
+        elif graph.ops[node] in CONSTANT or not any(a in moving for a in graph.args[node]):
+            continue
+        elif graph.ops[node] == "native" or np.issubdtype(graph.dtypes[node], np.inexact):
+            moving.add(node)
     return moving
 
 

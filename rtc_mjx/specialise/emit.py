@@ -57,10 +57,8 @@ def _parts(graph: Graph, order: Sequence[Node], last_use: dict[Node, int]) -> It
     """Cuts an order of evaluation into kernels, native operations apart; yields (position, nodes)."""
     start = 0
     while start < len(order):
-        if graph.ops[order[start]] in ("native", "result"):
-            end = start + 1
-        else:
-            end = _kernel_end(graph, order, start, last_use)
+        alone = graph.ops[order[start]] in ("native", "result")
+        end = start + 1 if alone else _kernel_end(graph, order, start, last_use)
         yield start, list(order[start:end])
         start = end
 
