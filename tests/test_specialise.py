@@ -123,7 +123,8 @@ MOVED = {  # of two 3 x 3 matrices
     "filled": lambda x, y: [jnp.take(x, PAST, 1, mode="fill", fill_value=5), x.at[PAST].get(mode="fill"), (x > y).at[7].get(mode="fill")],
     "filled integers": lambda x, y: [x, *(jnp.take(whole(x).astype(kind), PAST, 0, mode="fill") for kind in ("int32", "uint8"))],
     "along axes": lambda x, y: [jnp.take_along_axis(x, SORTED, 1), jnp.take_along_axis(y, SORTED[:1], 0)],
-    "batched gathers": lambda x, y: [jax.vmap(lambda r, i: r[i])(x, ROWS % 3), jax.vmap(lambda r: r[ROWS])(x), jax.vmap(lambda i: y[i])(ROWS)],
+    "batched gathers": lambda x, y: [jax.vmap(lambda r, i: r[i])(x, ROWS % 3), jax.vmap(lambda r: r[ROWS])(x)],
+    "gathers by batches": lambda x, y: [jax.vmap(lambda i: y[i])(ROWS), jax.vmap(lambda i: x[:, i])(ROWS)],
     "batched windows": lambda x, y: jax.vmap(lambda r, i: lax.dynamic_slice(r, (i,), (2,)))(x, COLUMNS),
     "scatters": lambda x, y: [x.at[ROWS[:2]].set(y[:2]), x.at[:, ROWS].add(y), x.at[0].subtract(2 * y[1])],
     "products": lambda x, y: [x.at[0].multiply(y[0], unique_indices=True), x.at[1].divide(2.0)],
@@ -225,8 +226,7 @@ TIES = {
 }
 
 
-@pytest.mark.parametrize("name", TIES)
-@DIAGONAL
+@in_turn(TIES)
 def test_gradients_at_ties_and_kinks_equal_plain(name, mode, dtype):
     x, y = jnp.asarray([0, 1, -1, 1, 2, 0], dtype), jnp.asarray([0, 1, -1, 2, 1, -3], dtype)
     assert_specialised_equals(TIES[name], x[None], y[None], mode)
@@ -277,8 +277,8 @@ def test_transforms_of_specialised_equal_transforms_of_plain(name, mode, dtype):
     def run(f):
         return with_gradient(lambda x, push: transform(f)({"x": x, "count": jnp.zeros((*states, 1), int)}, push))
 
-    if name == "alone":
-        assert_same(run(ours)(x, push), run(composed)(x, push), TOLERANCE[dtype])
+    if name == "alone":  # ours operation by operation
+        assert_same(run(ours)(x, push), jax.jit(run(composed), compiler_options=QUICK)(x, push), TOLERANCE[dtype])
     else:
         assert_equal(run(ours), run(composed), x, push)
 
@@ -337,7 +337,7 @@ def test_named_values_are_kept_and_not_computed_again_backwards(named):
     assert str(jax.make_jaxpr(jax.grad(ours))(jnp.ones(3))).count("while[") == (1 if named else 2)
 
 
-@pytest.mark.parametrize(("length", "operations", "slots"), [(4, 20, 115), (6, 60, 115), (4, 150, 3)])
+@pytest.mark.parametrize(("length", "operations", "slots"), [(4, 30, 115), (3, 150, 3)])
 def test_programs_cut_into_many_kernels_equal_plain(length, operations, slots, monkeypatch, x64):
     monkeypatch.setattr(emit, "KERNEL_OPERATIONS", operations)
     monkeypatch.setattr(emit, "KERNEL_SLOTS", slots)
@@ -387,8 +387,7 @@ COMPRESSED = {  # (function, how many numbers are passed on)
 }
 
 
-@pytest.mark.parametrize("name", COMPRESSED)
-@DIAGONAL
+@in_turn(COMPRESSED)
 def test_expanding_what_was_compacted_equals_plain(name, mode, dtype):
     function, passed = COMPRESSED[name]
     x = draw(dtype, 3)

@@ -49,7 +49,7 @@ def test_step_equals_mjx_step_where_no_actuator_is_clamped(name):
     world = make(name)
     inputs = draw(world, 1, seed=3)
     model, data = c_data(world, inputs, 0)
-    data.qvel[:] *= 0.05  # slow: the tyres stay below their limits
+    data.qvel[:] *= 0.02  # slow: the tyres stay below their limits
     state, control, around = inputs.arguments(world, 0)
     state = PhysicsState(state.qpos, jnp.asarray(data.qvel), state.warmstart)
     native = jax.jit(mjx.step)(mjx.put_model(model, impl="jax"), mjx.put_data(model, data, impl="jax"))
@@ -138,13 +138,11 @@ def test_non_finite_inputs_are_named_before_anything_runs(field):
 
 def test_controls_and_surroundings_that_do_not_fit_are_refused():
     world = make("car_2")
-    state, control, around = draw(world, 1).arguments(world, 0)
+    state, _, around = draw(world, 1).arguments(world, 0)
     with pytest.raises(UsageError, match="3 columns.*car0/drive, car0/steer"):
         simulate(world, state, jnp.zeros((5, 3)), around)
     with pytest.raises(UsageError, match="1 bodies.*has 2"):
         simulate(world, state, jnp.zeros((5, 2)), type(around)(around.pose[:1], around.size[:1]))
-    with pytest.raises(UsageError, match="'gauss'"):
-        step(world, state, control, around, solver="gauss")
 
 
 def test_played_back_surroundings_move():
