@@ -39,6 +39,7 @@ VARIANTS = ("native", "plain", "specialised", "handwritten")
 DIRECTIONS = ("forward", "gradient")
 BATCHES = (16, 64, 256, 1024, 4096)
 STEPS = 32  # physics steps of a rollout
+SAMPLE_SECONDS = 0.05  # how long one timed sample lasts at least
 MEMORY_LIMIT_MB = 6000.0  # rows that would need more are left out, and say so
 WHEELBASE = 2.8  # m, of the bicycle model
 
@@ -161,15 +162,23 @@ def measure(world_name: str, world: World, batch: int, direction: str, rounds: i
         analysis = compiled[name].memory_analysis()
         temp_mb[name] = analysis.temp_size_in_bytes / 1e6 if analysis else float("nan")
     fits = [name for name in compiled if temp_mb[name] <= MEMORY_LIMIT_MB]
+    calls = {name: max(1, int(SAMPLE_SECONDS / _seconds(compiled[name], inputs, 1))) for name in fits}
     times: dict[str, list[float]] = {name: [] for name in fits}
-    for turn in range(rounds + 1):
+    for _ in range(rounds):
         for name in fits:
-            start = time.perf_counter()
-            jax.block_until_ready(compiled[name](*inputs))
-            if turn:  # the first warms up
-                times[name].append(time.perf_counter() - start)
+            times[name].append(_seconds(compiled[name], inputs, calls[name]))
     rate = {name: batch * STEPS / float(np.median(times[name])) for name in fits}
     return [Row(world_name, batch, name, direction, rate.get(name), compile_s[name], temp_mb[name]) for name in compiled]
+
+
+def _seconds(function: Callable[..., Array], inputs: Inputs, calls: int) -> float:
+    """Seconds a call, of several in a row after one that warms up: a single short rollout would measure its dispatch."""
+    jax.block_until_ready(function(*inputs))
+    start = time.perf_counter()
+    for _ in range(calls):
+        out = function(*inputs)
+    jax.block_until_ready(out)
+    return (time.perf_counter() - start) / calls
 
 
 def first_result_seconds(world_name: str) -> float:

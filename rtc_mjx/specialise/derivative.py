@@ -1,6 +1,7 @@
 """Reverse mode on the scalar graph: the adjoint of a program is another program on the same graph.
 
-Only nodes that depend on a wanted input get adjoints. Ties follow JAX (max and min give half to each side). At x = 0 the
+Only nodes that depend on a wanted input get adjoints. Ties follow JAX (max and min give half to each side; a reduction over
+three or more equal values shares pairwise, where JAX gives equal parts). At x = 0 the
 square root's slope is taken as 0 where JAX gives infinity: norms then have derivative zero at rest instead of NaN.
 """
 
