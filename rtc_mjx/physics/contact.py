@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 from rtc_mjx.pytree import pytree
 
 SOLUTION = "contact_solution"  # what a checkpoint policy keeps, so that a backward pass need not solve again
-MAX_ITERATIONS = 32  # Newton steps; contact between cars takes 1 to 3, the worst of 10,000 random pile-ups took 11
+MAX_ITERATIONS = 32  # Newton steps; many more than the pile-ups of the tests need
 LINE_SEARCH_ITERATIONS = 2
 TOLERANCE = 1000  # in units of machine precision: by how much a row may end on the wrong side
 

@@ -1,14 +1,13 @@
 """From the scalar graph back to JAX: one operation per node, or a few kernels that hold hundreds of nodes each.
 
-On a CPU, XLA runs each scalar operation of a vmapped program as a loop of its own over the batch. A kernel runs them all
-in one loop, in registers. JAX has no such construct, but StableHLO's reduce carries a whole scalar computation, and this
-is a reduction in the strict sense: over two elements, (1, x) and (2, x), with
+On a CPU, XLA runs each scalar operation of a vmapped program as a loop of its own over the batch. A kernel runs them all in one
+loop, in registers. JAX has no such construct, but StableHLO's reduce carries a whole scalar computation, and this is a
+reduction in the strict sense: over two tagged elements, (0, x) and (1, x), with
 
-    (0, .) the identity,   (1, x) + (2, x) = (2, x) + (1, x) = (3, f(x)),
+    (-1, .) the identity,   (0, x) + (1, x) = (1, x) + (0, x) = (2, f(x)),
 
-so any order and any number of identities that XLA may insert give f(x). Measured against one operation per node with 1,000
-nodes: 4 to 5 times faster to run, 5 times faster to compile (`python -m rtc_mjx.benchmark`). Compile time explodes beyond
-about 2,000 nodes a kernel, so longer programs are cut.
+so any order and any number of identities that XLA may insert give f(x). What the compiler needs to make one vectorised loop of
+it, and where the limits below come from, is in docs/physics.md; longer programs are cut where few values cross.
 """
 
 from collections.abc import Callable, Iterator, Sequence
