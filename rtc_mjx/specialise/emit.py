@@ -110,14 +110,10 @@ def _run_scalars(graph: Graph, part: Sequence[Node], values: Values) -> None:
             values[node] = lax.select_n_p.bind(predicate, if_false, if_true)
         elif op == "convert":
             values[node] = lax.convert_element_type(arguments[0], dtype)
-        elif op in ("eq", "ne", "and", "or", "xor", "not") or op in ELEMENTWISE:
-            values[node] = _bind(ELEMENTWISE[op][1], arguments)
+        elif op in ELEMENTWISE:
+            values[node] = _FUNCTIONS[op](*arguments)
         else:
             raise NotImplementedError(f"scalar operation '{op}'")
-
-
-def _bind(primitive: Any, arguments: Sequence[Any]) -> Any:
-    return _FUNCTIONS[primitive.name](*arguments)
 
 
 _FUNCTIONS: dict[str, Callable[..., Any]] = {
