@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from rtc_mjx import cli, compilation_cache, pile_up
+from rtc_mjx import cache, cli, pile_up
 from rtc_mjx.errors import UsageError
 from rtc_mjx.physics import PhysicsState, Surroundings, World, load, rest_state, rest_surroundings, simulate, specialised_step
 
@@ -195,7 +195,7 @@ def first_result_seconds(world_name: str) -> float:
 
 
 def _first_result(world_name: str) -> float:
-    compilation_cache.enable()
+    cache.keep_compiled()
     world = WORLDS[world_name]()
     inputs = random_inputs(world, 64, STEPS)
     start = time.perf_counter()

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import NoReturn
 
-from rtc_mjx.errors import UsageError
+from rtc_mjx.errors import RunError, UsageError
 
 
 class Parser(argparse.ArgumentParser):
@@ -17,12 +17,15 @@ class Parser(argparse.ArgumentParser):
 
 
 def run(main: Callable[[Sequence[str] | None], None]) -> None:
-    """Runs a command's main function and turns `UsageError` into one line and status 2."""
+    """Runs a command's main function; `UsageError` becomes one line and status 2, a failure that has one line status 1."""
     try:
         main(None)
     except UsageError as error:
         sys.stderr.write(f"{error}\n")
         sys.exit(2)
+    except (RunError, OSError) as error:
+        sys.stderr.write(f"{error}\n")
+        sys.exit(1)
     except KeyboardInterrupt:
         sys.stderr.write("interrupted\n")
         sys.exit(1)

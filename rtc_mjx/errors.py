@@ -11,3 +11,7 @@ class UnsupportedWorldError(UsageError):
 
 class NonFiniteError(UsageError):
     """A state, control or surrounding handed to the simulator holds NaN or infinity."""
+
+
+class RunError(RuntimeError):
+    """A failure that is not the user's wrong use, in one line; commands exit with status 1."""

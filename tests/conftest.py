@@ -6,9 +6,9 @@ from jaxtyping import install_import_hook
 
 install_import_hook("rtc_mjx.physics", "beartype.beartype")  # before anything of the package is imported
 
-from rtc_mjx import compilation_cache  # noqa: E402
+from rtc_mjx import cache  # noqa: E402
 
-compilation_cache.enable()
+cache.keep_compiled()
 
 
 @pytest.fixture

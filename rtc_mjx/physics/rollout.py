@@ -46,21 +46,32 @@ def simulate(
     """
     check_inputs(world, state, controls, surroundings)
     played = surroundings.pose.ndim == 3
-    advance = one_step or (lambda *inputs: step(world, *inputs))
-    if one_step is None or constraint_rows(world):  # a specialised step in one piece keeps its inputs only as it is
-        advance = jax.checkpoint(advance, policy=jax.checkpoint_policies.save_only_these_names(SOLUTION))
+    advance = control_step(world, substeps, one_step or (lambda *inputs: step(world, *inputs)), one_step is None)
 
-    def control_step(state: PhysicsState, inputs: tuple[Array, Surroundings | None]) -> tuple[PhysicsState, PhysicsState]:
+    def body(state: PhysicsState, inputs: tuple[Array, Surroundings | None]) -> tuple[PhysicsState, PhysicsState]:
         control, moved = inputs
-        around = surroundings if moved is None else moved
-        if substeps == 1:
-            state = advance(state, control, around)
-        else:
-            state = lax.scan(lambda s, _: (advance(s, control, around), None), state, length=substeps)[0]
+        state = advance(state, control, surroundings if moved is None else moved)
         return state, state
 
-    body = control_step if substeps == 1 else jax.checkpoint(control_step)
     return lax.scan(body, state, (controls, surroundings if played else None))
+
+
+def control_step(world: World, substeps: int, one_step: OneStep, plain: bool = False) -> OneStep:
+    """One control step: physics steps under one control, so checkpointed that a backward pass keeps little.
+
+    Kept are the state before each control step and, while one control step is gone back through, the contact solutions of its
+    physics steps. A specialised step in one piece (no constraint rows, not `plain`) keeps its inputs only as it is.
+    """
+    advance = one_step
+    if plain or constraint_rows(world):
+        advance = jax.checkpoint(advance, policy=jax.checkpoint_policies.save_only_these_names(SOLUTION))
+    if substeps == 1:
+        return advance
+
+    def several(state: PhysicsState, control: Array, around: Surroundings) -> PhysicsState:
+        return lax.scan(lambda s, _: (advance(s, control, around), None), state, length=substeps)[0]
+
+    return jax.checkpoint(several)
 
 
 def check_inputs(world: World, state: PhysicsState, controls: Array, surroundings: Surroundings) -> None:

@@ -1,0 +1,219 @@
+"""Types g: the spaces they live in, and where a branch of a method takes them from.
+
+A type space turns the raw outputs of a network into a distribution over types. A source is a function (agent, demonstration, key)
+-> `Typed`; which one a branch uses is what tells the methods apart (`rtc_mjx.methods`). Paper, section IV.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from rtc_mjx.distributions import Distribution, Gaussian, GaussianMixture, OneHot
+from rtc_mjx.pytree import pytree
+
+if TYPE_CHECKING:
+    from rtc_mjx.models import Agent
+    from rtc_mjx.trajectory import Demonstration
+
+SMALLEST_SCALE = 0.05  # of a Gaussian type: a narrower posterior would let densities grow without bound
+
+
+class TypeSpace(Protocol):
+    """A space of types; `size` is the length of a type vector."""
+
+    size: int
+
+    @property
+    def posterior_outputs(self) -> int:
+        """How many numbers an encoder puts out."""
+
+    @property
+    def prior_outputs(self) -> int:
+        """How many numbers parametrise the prior."""
+
+    def posterior(self, outputs: Array) -> Distribution:
+        """The distribution an encoder's outputs stand for."""
+
+    def inference(self, outputs: Array) -> Distribution:
+        """InfoMGAIL's Q(g|s,a); continuous: of unit sigma, since a learned one makes the objective unbounded."""
+
+    def prior(self, outputs: Array) -> Distribution:
+        """The learned prior."""
+
+    def fixed_prior(self) -> Distribution:
+        """The prior of methods that do not learn one."""
+
+
+@dataclass(frozen=True)
+class NoType:
+    """The space of methods without types: vectors of length zero."""
+
+    size: int = 0
+    posterior_outputs: int = 0
+    prior_outputs: int = 0
+
+    def posterior(self, outputs: Array) -> Gaussian:
+        """Nothing to infer."""
+        return Gaussian(jnp.zeros(0), jnp.ones(0))
+
+    inference = prior = posterior
+
+    def fixed_prior(self) -> Gaussian:
+        """Nothing to draw."""
+        return Gaussian(jnp.zeros(0), jnp.ones(0))
+
+
+@dataclass(frozen=True)
+class Continuous:
+    """Real vectors: Gaussian encoder, mixture-of-Gaussians prior.
+
+    Attributes:
+        size: dimension of a type.
+        components: of the prior.
+    """
+
+    size: int
+    components: int
+
+    @property
+    def posterior_outputs(self) -> int:
+        """Mean and raw scale of each coordinate."""
+        return 2 * self.size
+
+    @property
+    def prior_outputs(self) -> int:
+        """Weight of each component, mean and raw scale of each of its coordinates."""
+        return self.components * (1 + 2 * self.size)
+
+    def posterior(self, outputs: Array) -> Gaussian:
+        """A Gaussian whose scale stays between SMALLEST_SCALE and about 1 at outputs near zero."""
+        mean, raw = jnp.split(outputs, 2, axis=-1)
+        return Gaussian(mean, scale_of(raw))
+
+    def inference(self, outputs: Array) -> Gaussian:
+        """A Gaussian of unit scale."""
+        mean, _ = jnp.split(outputs, 2, axis=-1)
+        return Gaussian(mean, jnp.ones_like(mean))
+
+    def prior(self, outputs: Array) -> GaussianMixture:
+        """The mixture."""
+        return mixture_of(outputs, self.components, self.size, SMALLEST_SCALE)
+
+    def fixed_prior(self) -> Gaussian:
+        """The standard normal."""
+        return Gaussian(jnp.zeros(self.size), jnp.ones(self.size))
+
+
+@dataclass(frozen=True)
+class Discrete:
+    """One of a number of categories, as a one-hot vector.
+
+    Attributes:
+        size: number of categories.
+    """
+
+    size: int
+
+    @property
+    def posterior_outputs(self) -> int:
+        """One logit a category."""
+        return self.size
+
+    @property
+    def prior_outputs(self) -> int:
+        """One logit a category."""
+        return self.size
+
+    def posterior(self, outputs: Array) -> OneHot:
+        """The categorical distribution of the logits."""
+        return OneHot(outputs)
+
+    inference = prior = posterior
+
+    def fixed_prior(self) -> OneHot:
+        """All categories alike."""
+        return OneHot(jnp.zeros(self.size))
+
+
+@pytree
+class Typed:
+    """A type with the distribution it was drawn from.
+
+    Attributes:
+        agent_type: g.
+        posterior: e(g|tau) where the encoder inferred it, else None.
+    """
+
+    agent_type: Float[Array, "*batch size"]
+    posterior: Any
+
+
+Source = Callable[["Agent", "Demonstration", Array], Typed]
+
+
+def scale_of(raw: Array, smallest: float = SMALLEST_SCALE) -> Array:
+    """A standard deviation from a network's raw output: at least `smallest`, and near 0.7 at zero."""
+    return smallest + jnp.logaddexp(raw, 0.0)
+
+
+def mixture_of(outputs: Array, components: int, size: int, smallest: float) -> GaussianMixture:
+    """A mixture of Gaussians from the outputs of a network: weights, means, raw scales."""
+    logits, mean, raw = jnp.split(outputs, [components, components * (1 + size)], axis=-1)
+    shape = (*outputs.shape[:-1], components, size)
+    return GaussianMixture(logits, mean.reshape(shape), scale_of(raw.reshape(shape), smallest))
+
+
+def from_none(agent: "Agent", demonstration: "Demonstration", key: Array) -> Typed:
+    """No type: a vector of length zero."""
+    return Typed(jnp.zeros(agent.space.size), None)
+
+
+def from_fixed_prior(agent: "Agent", demonstration: "Demonstration", key: Array) -> Typed:
+    """InfoMGAIL: a draw from a prior that is not learned."""
+    prior = agent.space.fixed_prior()
+    return Typed(prior.sample(prior.noise(key)), None)
+
+
+def from_prior(agent: "Agent", demonstration: "Demonstration", key: Array) -> Typed:
+    """g_p ~ p(g), with p held fixed: nothing flows back into the prior (paper, eq. 3)."""
+    prior = agent.prior()
+    return Typed(lax.stop_gradient(prior.sample(prior.noise(key))), None)  # p fixed
+
+
+def from_encoder(agent: "Agent", demonstration: "Demonstration", key: Array) -> Typed:
+    """g_e ~ e(g|tau), reparameterised: what is lost under g_e flows back into the encoder (paper, eq. 3)."""
+    posterior = agent.posterior(demonstration.trajectory)
+    return Typed(posterior.sample(posterior.noise(key)), posterior)
+
+
+def from_inference(agent: "Agent", demonstration: "Demonstration", key: Array) -> Typed:
+    """InfoMGAIL's cloning: the type that Q itself reads off the demonstration, held fixed.
+
+    A randomly paired type would teach the policy to ignore types. Q sees one step at a time; evidence is averaged over steps.
+    """
+    track = demonstration.trajectory
+    seen = agent.inference_outputs(track.observations[:-1], track.actions)
+    inferred = agent.space.posterior(jnp.mean(seen, axis=0))
+    if isinstance(inferred, OneHot):
+        inferred = agent.space.posterior(jnp.sum(seen, axis=0))  # independent evidence multiplies
+        return Typed(lax.stop_gradient(inferred.sample(inferred.noise(key))), None)
+    return Typed(lax.stop_gradient(agent.space.inference(jnp.mean(seen, axis=0)).mean), None)
+
+
+def from_label(agent: "Agent", demonstration: "Demonstration", key: Array) -> Typed:
+    """Symphony: the hand-made label of the demonstration."""
+    return Typed(agent.scene.label(demonstration.trajectory), None)
+
+
+SOURCES: dict[str, Source] = {
+    "none": from_none,
+    "fixed_prior": from_fixed_prior,
+    "prior": from_prior,
+    "encoder": from_encoder,
+    "inference": from_inference,
+    "label": from_label,
+}

@@ -1,0 +1,317 @@
+"""The settings of a run: defaults < configs/<scene>.toml < command line; every run writes what came out, and it is read back here.
+
+Settings are frozen dataclasses; tyro turns them into options (`--losses.adversarial 0.5`). A [methods.NAME] table of a TOML file
+holds what differs for one method.
+"""
+
+import argparse
+import contextlib
+import dataclasses
+import io
+import json
+import tomllib
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from rtc_mjx.errors import UsageError
+from rtc_mjx.learner import OptimiserOptions
+from rtc_mjx.losses import LossWeights
+from rtc_mjx.methods import METHODS, method_name
+from rtc_mjx.models import ModelOptions
+from rtc_mjx.scenes import DoubleGoal, Scene, scene_type
+
+
+@dataclass(frozen=True)
+class Experts:
+    """Demonstrations.
+
+    Attributes:
+        train: how many to learn from.
+        test: how many to compare with during training and in `evaluate`.
+    """
+
+    train: int = 8192
+    test: int = 2048
+
+
+@dataclass(frozen=True)
+class Intervals:
+    """Numbers of updates between events; `test` and `save` are multiples of `log`.
+
+    Attributes:
+        log: a line of metrics.
+        test: the scene's metrics on test episodes.
+        save: a checkpoint.
+    """
+
+    log: int = 100
+    test: int = 500
+    save: int = 500
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that determines a training.
+
+    Attributes:
+        scene: settings of the scene.
+        method: which method.
+        seeds: how many trainings at once, in one program.
+        first_seed: the seed of the first; the others follow.
+        updates: length of the training.
+        batch: episodes of a minibatch.
+        encoder_share: share of the minibatch that takes types from the encoder, where a method has both (the paper's f).
+        run: directory of the run; runs/<scene>/<method> if not given.
+        resume: go on with the run in that directory.
+        model: networks and types.
+        losses: weights.
+        optimiser: gradients and rates.
+        experts: demonstrations.
+        every: intervals.
+    """
+
+    scene: Scene = field(default_factory=DoubleGoal)
+    method: str = "rtc"
+    seeds: int = 1
+    first_seed: int = 0
+    updates: int = 4000
+    batch: int = 64
+    encoder_share: float = 0.5
+    run: Path | None = None
+    resume: bool = False
+    model: ModelOptions = ModelOptions()
+    losses: LossWeights = LossWeights()
+    optimiser: OptimiserOptions = OptimiserOptions()
+    experts: Experts = Experts()
+    every: Intervals = Intervals()
+
+    @property
+    def folder(self) -> Path:
+        """The run directory."""
+        return self.run or Path("runs") / self.scene.name / self.method
+
+
+LEAST = {
+    "seeds": 1, "first_seed": 0, "updates": 1, "batch": 4, "model.width": 1, "model.depth": 1, "model.mixture": 1, "model.type_size": 1,
+    "model.type_count": 2, "model.prior_components": 1, "losses.adversarial_ramp": 0, "experts.train": 4, "experts.test": 4,
+    "every.log": 1, "every.test": 1, "every.save": 1, "scene.steps": 1,
+}  # fmt: skip
+POSITIVE = ("model.smallest_scale", "optimiser.learning_rate", "optimiser.discriminator_rate", "optimiser.clip", "optimiser.trajectory_clip")
+NOT_NEGATIVE = tuple(f"losses.{f.name}" for f in dataclasses.fields(LossWeights) if f.type is float or f.type == "float")
+SHARES = ("encoder_share", "optimiser.final_rate", "optimiser.decay", "scene.lower_probability")
+
+
+def configs() -> Path:
+    """The folder of committed settings: beside the package in a checkout, inside it in an installed wheel."""
+    inside = Path(str(resources.files("rtc_mjx"))) / "configs"
+    return inside if inside.is_dir() else Path(__file__).resolve().parents[1] / "configs"
+
+
+def from_command_line(argv: Sequence[str], prog: str) -> Config:
+    """The settings of a training.
+
+    Raises:
+        UsageError: an unknown option or name, or a value of the wrong type or out of range; one line.
+    """
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    first.add_argument("--scene", default=None)
+    first.add_argument("--method", default=None)
+    first.add_argument("--run", type=Path, default=None)
+    first.add_argument("--resume", action="store_true")
+    try:
+        given, _ = first.parse_known_args(list(argv))
+    except argparse.ArgumentError as error:
+        raise UsageError(f"{prog}: {error}") from error
+    if given.resume:
+        return _resumed(given, list(argv), prog)
+    config = defaults(given.scene or "double_goal", method_name(given.method or Config.method))
+    return check(_parse(config, _without(argv, "--scene", "--method"), prog))
+
+
+def defaults(scene: str, method: str) -> Config:
+    """The settings of a scene and a method, as committed."""
+    config = Config(scene=scene_type(scene)(), method=method)
+    file = configs() / f"{scene}.toml"
+    if not file.is_file():
+        return config
+    try:
+        table = tomllib.loads(file.read_text())
+    except tomllib.TOMLDecodeError as error:
+        raise UsageError(f"{file}: {error}") from error
+    by_method = table.pop("methods", {})
+    for name in by_method:
+        if name not in METHODS:
+            raise UsageError(f"{file}: [methods.{name}]: no such method; there are {', '.join(METHODS)}")
+    return check(merge(merge(config, table, str(file)), by_method.get(method, {}), f"{file} [methods.{method}]"))
+
+
+def _resumed(given: argparse.Namespace, argv: list[str], prog: str) -> Config:
+    """The settings of the run that is resumed; what the command line says as well must agree."""
+    folder = given.run
+    if folder is None and given.scene and given.method:
+        folder = Config(scene=scene_type(given.scene)(), method=method_name(given.method)).folder
+    if folder is None:
+        raise UsageError("--resume: say which run with --run DIR")
+    held = read(folder)
+    if given.scene and given.scene != held.scene.name:
+        raise UsageError(f"--scene {given.scene}: the run in {folder} is of scene {held.scene.name}")
+    if given.method and method_name(given.method) != held.method:
+        raise UsageError(f"--method {given.method}: the run in {folder} is of method {held.method}")
+    wanted = check(_parse(dataclasses.replace(held, run=folder, resume=True), _without(argv, "--scene", "--method"), prog))
+    ours, theirs = flat(to_dict(wanted)), flat(to_dict(held))
+    for name in ours:
+        if ours[name] != theirs[name] and name not in ("run", "resume"):
+            raise UsageError(f"--{name} {ours[name]}: the run in {folder} has {theirs[name]}; resume without the option, or start a new run")
+    return wanted
+
+
+def _without(argv: Sequence[str], *options: str) -> list[str]:
+    """The arguments without these options and their values."""
+    left, skip = [], False
+    for word in argv:
+        if skip or word.split("=")[0] in options:
+            skip = not skip and "=" not in word
+            continue
+        left.append(word)
+    return left
+
+
+def _parse(config: Config, argv: list[str], prog: str) -> Config:
+    """tyro's parse; its boxed messages become one line."""
+    told = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(told):
+            return tyro.cli(Config, prog=prog, description=DESCRIPTION, default=config, args=argv, config=(tyro.conf.AvoidSubcommands,))
+    except SystemExit as stop:
+        if stop.code in (0, None):
+            raise
+        raise UsageError(_one_line(told.getvalue(), prog)) from None
+
+
+DESCRIPTION = """Trains a method on a scene. `--scene NAME` and `--method NAME` choose; all else has a default (configs/<scene>.toml)."""
+
+
+def _one_line(boxed: str, prog: str) -> str:
+    """The first message of tyro's box, with the option it suggests."""
+    lines = [line.strip("│╭╮╰╯─ ").strip() for line in boxed.splitlines()]
+    lines = [line for line in lines[1:] if line]
+    options = [line.split()[0] for line in lines[1:] if line.startswith("--")]
+    near = f"; near it: {', '.join(dict.fromkeys(options[:3]))}" if "nrecognized" in (lines or [""])[0] and options else ""
+    return f"{prog}: {lines[0] if lines else boxed.strip()}{near} (see --help)"
+
+
+def merge(settings: Any, table: Mapping[str, Any], where: str) -> Any:
+    """The dataclass with the fields that a TOML table names replaced.
+
+    Raises:
+        UsageError: no such field, or a value of another type; the message names file, key and what is accepted.
+    """
+    hints = typing.get_type_hints(type(settings))
+    changed = {}
+    for key, value in table.items():
+        held = getattr(settings, key, None)
+        if key not in {f.name for f in dataclasses.fields(settings)}:
+            raise UsageError(f"{where}: unknown key '{key}'; there are {', '.join(f.name for f in dataclasses.fields(settings))}")
+        if dataclasses.is_dataclass(held):
+            if not isinstance(value, Mapping):
+                raise UsageError(f"{where}: '{key}' is a table, got {value!r}")
+            changed[key] = merge(held, value, f"{where} [{key}]")
+        else:
+            changed[key] = _typed(value, hints[key], f"{where}: '{key}'")
+    return dataclasses.replace(settings, **changed)
+
+
+def _typed(value: Any, kind: Any, where: str) -> Any:
+    """The value as the type that a field has."""
+    options = typing.get_args(kind)
+    if typing.get_origin(kind) is typing.Literal:
+        if value in options:
+            return value
+        raise UsageError(f"{where} is {value!r}; accepted are {', '.join(map(repr, options))}")
+    if isinstance(kind, types.UnionType):
+        if value is None:
+            return None
+        kind = next(k for k in options if k is not types.NoneType)
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if type(value) is kind:
+        return value
+    raise UsageError(f"{where} is {value!r}; a value of type {kind.__name__} is needed")
+
+
+def check(config: Config) -> Config:
+    """The settings, if every value is in its range and they fit each other.
+
+    Raises:
+        UsageError: the first that is not; one line with its option and what is accepted.
+    """
+    values = flat(to_dict(config))
+    for name, value in values.items():
+        if isinstance(value, float) and value != value:
+            raise UsageError(f"--{name} {value}: a number is needed")
+        if name in LEAST and value < LEAST[name]:
+            raise UsageError(f"--{name} {value}: at least {LEAST[name]} is needed")
+        if name in POSITIVE and not 0 < value < float("inf"):
+            raise UsageError(f"--{name} {value}: a positive number is needed")
+        if name in NOT_NEGATIVE and not 0 <= value < float("inf"):
+            raise UsageError(f"--{name} {value}: a number from 0 on is needed")
+        if name in SHARES and not 0 <= value <= 1:
+            raise UsageError(f"--{name} {value}: a number between 0 and 1 is needed")
+    for name in ("test", "save"):
+        if values[f"every.{name}"] % config.every.log:
+            raise UsageError(f"--every.{name} {values[f'every.{name}']}: a multiple of --every.log {config.every.log} is needed")
+    split = round(config.batch * config.encoder_share)
+    shares = {b.share for b in METHODS[method_name(config.method)].branches}
+    if "rest" in shares and not 0 < split < config.batch:
+        raise UsageError(f"--encoder-share {config.encoder_share}: of a batch of {config.batch} both parts need an episode")
+    if METHODS[method_name(config.method)].kind == "label" and not config.scene.labels:
+        raise UsageError(f"--method {config.method}: scene {config.scene.name} has no hand-made labels")
+    return dataclasses.replace(config, method=method_name(config.method))
+
+
+def to_dict(config: Config) -> dict[str, Any]:
+    """The settings as JSON holds them; the scene by name and settings, without what only places the run."""
+    table = dataclasses.asdict(config)
+    table["scene"] = {"name": config.scene.name, **table["scene"]}
+    table["run"], table["resume"] = None, False
+    return table
+
+
+def flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings by dotted name."""
+    out: dict[str, Any] = {}
+    for key, value in table.items():
+        out |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return out
+
+
+def write(config: Config, folder: Path) -> None:
+    """Writes config.json."""
+    (folder / "config.json").write_text(json.dumps(to_dict(config), indent=1) + "\n")
+
+
+def read(folder: Path) -> Config:
+    """The settings of a run directory.
+
+    Raises:
+        UsageError: there is no run, or its config.json is damaged or of another version.
+    """
+    file = folder / "config.json"
+    if not file.is_file():
+        raise UsageError(f"{folder} is not a run directory: it has no config.json")
+    try:
+        table = json.loads(file.read_text())
+        scene = table.pop("scene")
+        config = Config(scene=merge(scene_type(scene.pop("name"))(), scene, f"{file} [scene]"))
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise error if isinstance(error, UsageError) else UsageError(f"{file} is damaged: {error}") from error
+    return check(dataclasses.replace(merge(config, table, str(file)), run=folder))

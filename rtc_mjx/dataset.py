@@ -1,0 +1,92 @@
+"""Demonstrations: experts let loose in a scene, once, and kept on disk under a hash of everything that made them."""
+
+import dataclasses
+import hashlib
+import inspect
+import json
+import os
+import tempfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rtc_mjx import cache
+from rtc_mjx.models import Statistics
+from rtc_mjx.rollout import rollout
+from rtc_mjx.scenes import Scene
+from rtc_mjx.trajectory import Demonstration
+
+CHUNK = 1024  # episodes simulated at once
+
+
+def demonstrate(scene: Scene, key: jax.Array) -> Demonstration:
+    """One episode driven by the scene's expert."""
+    outside, inside = jax.random.split(key)
+    episode = scene.reset(outside)
+    actor, truth = scene.expert(inside, episode)
+    return Demonstration(episode, rollout(scene, actor, episode), truth)
+
+
+def demonstrations(scene: Scene, count: int, seed: int) -> Demonstration:
+    """Demonstrations with a leading axis of `count`, as numpy arrays; made on first use, then read from the cache.
+
+    Args:
+        scene: the scene and its settings.
+        count: how many.
+        seed: demonstrations of different seeds are independent.
+    """
+    make = jax.jit(jax.vmap(lambda key: demonstrate(scene, key)))
+    shapes = jax.eval_shape(make, jax.random.split(jax.random.key(seed), count))
+    file = cache.folder() / "demonstrations" / f"{scene.name}-{fingerprint(scene, count, seed)}.npz"
+    leaves = _read(file, jax.tree.leaves(shapes))
+    if leaves is None:
+        keys = jax.random.split(jax.random.key(seed), count)
+        parts = [jax.device_get(make(keys[i : i + CHUNK])) for i in range(0, count, CHUNK)]
+        leaves = jax.tree.leaves(jax.tree.map(lambda *x: np.concatenate(x), *parts))
+        _write(file, leaves)
+    return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
+
+
+def fingerprint(scene: Scene, count: int, seed: int) -> str:
+    """Hash of all that determines a set of demonstrations: settings, code of the scene, compiled world, precision, count, seed."""
+    made_by = {
+        "settings": dataclasses.asdict(scene),
+        "code": hashlib.sha256(inspect.getsource(inspect.getmodule(type(scene))).encode()).hexdigest(),  # type: ignore[arg-type]
+        "world": scene.world.fingerprint,
+        "type": str(jnp.zeros(0).dtype),
+        "count": count,
+        "seed": seed,
+    }
+    return hashlib.sha256(json.dumps(made_by, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def statistics(expert: Demonstration) -> Statistics:
+    """Mean and standard deviation of the expert's observations and actions over episodes and time."""
+
+    def moments(x: np.ndarray) -> tuple[jax.Array, jax.Array]:
+        flat = np.asarray(x, np.float64).reshape(-1, x.shape[-1])
+        scale = flat.std(axis=0)
+        return jnp.asarray(flat.mean(axis=0), jnp.float32), jnp.asarray(np.where(scale > 1e-6, scale, 1.0), jnp.float32)
+
+    return Statistics(*moments(expert.trajectory.observations), *moments(expert.trajectory.actions))
+
+
+def _read(file: Path, shapes: list[jax.ShapeDtypeStruct]) -> list[np.ndarray] | None:
+    """The arrays of a cache file; None where it is absent or damaged (it is then made again)."""
+    try:
+        with np.load(file, allow_pickle=False) as held:
+            leaves = [held[str(i)] for i in range(len(shapes))]
+    except (OSError, ValueError, KeyError, EOFError, cache.DAMAGED):
+        return None
+    fits = all(x.shape == s.shape and x.dtype == s.dtype for x, s in zip(leaves, shapes, strict=True))
+    return leaves if fits else None
+
+
+def _write(file: Path, leaves: list[np.ndarray]) -> None:
+    """Writes beside and renames, so that a reader or a second writer never sees half a file."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".part", delete=False) as part:
+        np.savez(part, **{str(i): x for i, x in enumerate(leaves)})
+    os.replace(part.name, file)

@@ -1,0 +1,186 @@
+"""How an agent does on its own, and what conditional type shift costs it.
+
+Three rollouts of the same test episodes (method notes, section 7): types from each episode's own demonstration (paired), from
+another episode's (shuffled), from the prior. Paired to shuffled is conditional shift, shuffled to prior is marginal shift. The
+expert, and expert against expert at the same size, stand beside them: the ceiling, and the floor of every divergence.
+"""
+
+import argparse
+import functools
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import random
+from jaxtyping import Array
+from rich.console import Console
+from rich.table import Table
+
+from rtc_mjx import cache, cli, dataset, metrics
+from rtc_mjx.agent_types import SOURCES
+from rtc_mjx.config import Config
+from rtc_mjx.errors import UsageError
+from rtc_mjx.learner import Learner, TrainState, start
+from rtc_mjx.methods import METHODS, Method
+from rtc_mjx.models import Networks
+from rtc_mjx.runs import Run
+from rtc_mjx.trajectory import Demonstration
+
+TRAIN_DATA, TEST_DATA, SECOND_TEST_DATA = 0, 1, 2  # seeds of demonstrations: independent sets
+NOISE = 7  # seed of the rollouts' noise
+Features = dict[str, np.ndarray]
+
+
+def learner_for(config: Config, expert: Demonstration) -> Learner:
+    """The learner of a run's settings; `expert` are its training demonstrations."""
+    method = METHODS[config.method]
+    return Learner(
+        scene=config.scene,
+        method=method,
+        space=method.space(config.model, config.scene.labels),
+        statistics=dataset.statistics(expert),
+        model=config.model,
+        weights=config.losses,
+        optimiser=config.optimiser,
+        updates=config.updates,
+        batch=config.batch,
+        encoder_share=config.encoder_share,
+    )
+
+
+def seeds_of(config: Config) -> Array:
+    """The seeds that a run trains."""
+    return config.first_seed + jnp.arange(config.seeds)
+
+
+def type_sources(method: Method) -> tuple[str, ...]:
+    """Where test types may come from: the prior, and, where there is an encoder, demonstrations."""
+    return ("prior", "paired", "shuffled") if method.encodes else ("prior",)
+
+
+Roll = Callable[[Networks, Demonstration, Array], dict[str, dict[str, Array]]]
+
+
+def roller(learner: Learner) -> Roll:
+    """A compiled function (networks of all seeds, test demonstrations, key) -> features per type source, (seeds, episodes)."""
+    sources = type_sources(learner.method)
+
+    def one(networks: Networks, mine: Demonstration, other: Demonstration, key: Array) -> dict[str, dict[str, Array]]:
+        agent = learner.agent(networks)
+        draw, noise = random.split(key)
+        inferred = functools.partial(SOURCES["encoder"], agent)
+        ways = {
+            "prior": lambda: SOURCES[learner.method.test_types](agent, mine, draw),
+            "paired": lambda: inferred(mine, draw),
+            "shuffled": lambda: inferred(other, draw),
+        }
+        nudge = jnp.zeros((learner.scene.steps, agent.outputs))
+        tracks = {name: learner.play(agent, mine.episode, ways[name]().agent_type, noise, nudge) for name in sources}
+        return {name: learner.scene.features(mine.episode, track) for name, track in tracks.items()}
+
+    def all_episodes(networks: Networks, test: Demonstration, key: Array) -> dict[str, dict[str, Array]]:
+        other = jax.tree.map(lambda x: jnp.roll(x, 1, axis=0), test)
+        keys = random.split(key, jax.tree.leaves(test)[0].shape[0])
+        return jax.vmap(functools.partial(one, networks))(test, other, keys)
+
+    return jax.jit(jax.vmap(all_episodes, in_axes=(0, None, None)))
+
+
+def expert_features(config: Config, test: Demonstration) -> Features:
+    """Features of the test demonstrations."""
+    return jax.device_get(jax.jit(jax.vmap(config.scene.features))(test.episode, test.trajectory))
+
+
+def score(config: Config, features: dict[str, Features], expert: Features) -> dict[str, dict[str, list[float]]]:
+    """Metrics per type source, a list over seeds."""
+    out: dict[str, dict[str, list[float]]] = {}
+    for source, arrays in features.items():
+        rows = [config.scene.metrics({k: v[i] for k, v in arrays.items()}, expert) for i in range(config.seeds)]
+        out[source] = {name: [row[name] for row in rows] for name in rows[0]}
+    return out
+
+
+def without_truth(demonstrations: Demonstration) -> Demonstration:
+    """On the device, without what only an analysis may see."""
+    return Demonstration(*jax.tree.map(jnp.asarray, (demonstrations.episode, demonstrations.trajectory)), truth=())
+
+
+def evaluate(run: Run, episodes: int) -> dict[str, Any]:
+    """All of evaluation.json for a run's last whole checkpoint."""
+    config = run.config
+    train = dataset.demonstrations(config.scene, config.experts.train, TRAIN_DATA)
+    tests = [dataset.demonstrations(config.scene, episodes, seed) for seed in (TEST_DATA, SECOND_TEST_DATA)]
+    learner = learner_for(config, train)
+    update, state, _ = run.restore(jax.eval_shape(jax.vmap(functools.partial(start, learner)), seeds_of(config)))
+    features = jax.device_get(roller(learner)(_networks(state), without_truth(tests[0]), random.key(NOISE)))
+    expert, second = (expert_features(config, test) for test in tests)
+    table = score(config, features, expert)
+    means = {source: {name: _summary(config, source, name, features, expert, table) for name in table[source]} for source in table}
+    return {
+        "scene": config.scene.name,
+        "method": config.method,
+        "seeds": config.seeds,
+        "episodes": episodes,
+        "update": update,
+        "metrics": means["prior"],
+        "types": means,
+        "reference": {"expert": config.scene.metrics(expert, expert), "expert_vs_expert": config.scene.metrics(second, expert)},
+    }
+
+
+def _networks(state: TrainState) -> Networks:
+    return state.networks
+
+
+def _summary(
+    config: Config, source: str, name: str, features: dict[str, Features], expert: Features, table: dict[str, dict[str, list[float]]]
+) -> dict[str, Any]:
+    """Per seed, mean, standard deviation, and a bootstrap interval of the mean over test episodes."""
+    values = table[source][name]
+
+    def mean_over_seeds(rows: np.ndarray) -> float:
+        reference = {k: v[rows] for k, v in expert.items()}
+        drawn = [{k: v[i][rows] for k, v in features[source].items()} for i in range(config.seeds)]
+        return float(np.mean([config.scene.metrics(d, reference)[name] for d in drawn]))
+
+    count = len(next(iter(expert.values())))
+    low, high = metrics.bootstrap(np.arange(count), mean_over_seeds, draws=200)
+    spread = float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+    return {"per_seed": values, "mean": float(np.mean(values)), "std": spread, "interval": [low, high]}
+
+
+def table(result: dict[str, Any]) -> Table:
+    """The result for the terminal."""
+    out = Table(title=f"{result['method']} on {result['scene']}: {result['seeds']} seeds, {result['episodes']} episodes")
+    out.add_column("types")
+    names = list(result["metrics"])
+    for name in names:
+        out.add_column(name, justify="right")
+    for source, summary in result["types"].items():
+        out.add_row(source, *(f"{s['mean']:.4g} ± {s['std']:.2g}  [{s['interval'][0]:.4g}, {s['interval'][1]:.4g}]" for s in summary.values()))
+    for who, values in result["reference"].items():
+        out.add_row(who.replace("_", " "), *(f"{values[name]:.4g}" for name in names))
+    return out
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Evaluates a run."""
+    parser = cli.Parser(prog="python -m rtc_mjx.evaluate", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run", type=Path, required=True, metavar="DIR", help="the run directory; its last checkpoint is evaluated")
+    parser.add_argument("--episodes", type=int, metavar="N", help="test episodes (default: experts.test of the run)")
+    options = parser.parse_args(argv)
+    if options.episodes is not None and options.episodes < 4:
+        raise UsageError(f"--episodes {options.episodes}: at least 4 are needed")
+    cache.keep_compiled()
+    run = Run.open(options.run)
+    result = evaluate(run, options.episodes or run.config.experts.test)
+    (run.folder / "evaluation.json").write_text(json.dumps(result, indent=1) + "\n")
+    Console(width=None if Console().is_terminal else 140).print(table(result))
+
+
+if __name__ == "__main__":
+    cli.run(main)

@@ -1,0 +1,269 @@
+"""One update of one seed, the same for every method.
+
+    minibatch -> types of each branch -> rollouts (one call for all branches)
+    losses of each branch -> gradient by networks, and by the rollouts
+    rollouts' gradient -> through physics and policy back to the policy's outputs at every step: guarded trajectory by trajectory
+    outputs' gradient -> networks, for all steps and episodes at once -> optimiser
+
+The policy's networks are held fixed *inside* the simulation loop; the gradient by its outputs at each step, which carries all that a
+step causes later, is applied to the networks afterwards. The sum is the same gradient as going through the loop with them, at
+a fraction of the cost, and each trajectory's share can be inspected before it counts.
+"""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import lax, random
+from jaxtyping import Array, Float, Int
+
+from rtc_mjx.agent_types import SOURCES, Typed, TypeSpace
+from rtc_mjx.losses import CLOSED_LOOP, LOSSES, Case, LossWeights, gradient_penalty
+from rtc_mjx.methods import Branch, Method
+from rtc_mjx.models import Agent, ModelOptions, Networks, Statistics, make_networks
+from rtc_mjx.physics import OneStep
+from rtc_mjx.pytree import pytree
+from rtc_mjx.rollout import GradientMode, rollout
+from rtc_mjx.scenes import Scene
+from rtc_mjx.trajectory import Demonstration, Episode, Trajectory
+
+
+@dataclass(frozen=True)
+class OptimiserOptions:
+    """How gradients become updates.
+
+    Attributes:
+        learning_rate: Adam's, of policy, encoder and prior; falls along a half cosine to `final_rate` of it.
+        discriminator_rate: Adam's, of discriminator and Q; constant.
+        final_rate: share of the learning rate left at the last update.
+        clip: largest norm of an update's gradient, policy and discriminator apart.
+        trajectory_clip: largest norm of one trajectory's gradient by the policy's outputs, in units of the minibatch's mean loss.
+        gradient: what flows back from step to step of a rollout.
+        decay: shrinks the backward signal at each step back in time.
+    """
+
+    learning_rate: float = 1e-3
+    discriminator_rate: float = 1e-3
+    final_rate: float = 0.1
+    clip: float = 1.0
+    trajectory_clip: float = 10.0
+    gradient: GradientMode = "full"
+    decay: float = 1.0
+
+
+@dataclass(frozen=True)
+class Learner:
+    """All that is static in a training: what is learned, by which method, how.
+
+    Attributes:
+        scene: where.
+        method: which branches and losses.
+        space: of types.
+        statistics: of the expert.
+        model: sizes.
+        weights: of the losses.
+        optimiser: options.
+        updates: length of the training; learning rates follow it.
+        batch: episodes of a minibatch.
+        encoder_share: the paper's f.
+        one_step: physics in place of the scene's own.
+    """
+
+    scene: Scene
+    method: Method
+    space: TypeSpace
+    statistics: Statistics
+    model: ModelOptions
+    weights: LossWeights
+    optimiser: OptimiserOptions
+    updates: int
+    batch: int
+    encoder_share: float
+    one_step: OneStep | None = None
+
+    def agent(self, networks: Networks) -> Agent:
+        """The agent that these networks make."""
+        return Agent(networks, self.statistics, self.model, self.space, self.scene)
+
+    def rows(self, branch: Branch) -> slice:
+        """The rows of the minibatch that a branch takes."""
+        return branch.rows(self.batch, self.encoder_share)
+
+    def play(self, agent: Agent, episode: Episode, agent_type: Array, key: Array, nudge: Array) -> Trajectory:
+        """One rollout of the policy under one type, with `nudge` (T, outputs) added to its outputs to differentiate by."""
+        options, actor = self.optimiser, agent.actor(agent_type, key, nudge)
+        return rollout(self.scene, actor, episode, gradient=options.gradient, decay=options.decay, one_step=self.one_step)
+
+
+@pytree
+class TrainState:
+    """What one update hands to the next; of one seed, or with a leading axis of seeds.
+
+    Attributes:
+        networks: what is learned.
+        optimiser: Adam's moments.
+        seed: of the training; all randomness is a function of it and the update.
+        update: number of updates made.
+    """
+
+    networks: Networks
+    optimiser: Any
+    seed: Int[Array, "*seeds"]
+    update: Int[Array, "*seeds"]
+
+
+def start(learner: Learner, seed: Array) -> TrainState:
+    """The state before the first update."""
+    features = learner.statistics.observation_mean.shape[-1]
+    networks = make_networks(random.key(seed), learner.scene, features, learner.space, learner.model, learner.method.parts)
+    return TrainState(networks, transformation(learner).init(networks), seed, jnp.zeros((), int))
+
+
+def transformation(learner: Learner) -> optax.GradientTransformation:
+    """Adam with clipping, policy side and discriminator side apart."""
+    options = learner.optimiser
+    schedule = optax.cosine_decay_schedule(options.learning_rate, learner.updates, alpha=options.final_rate)
+    sides = {
+        "agent": optax.chain(optax.clip_by_global_norm(options.clip), optax.adam(schedule)),
+        "critic": optax.chain(optax.clip_by_global_norm(options.clip), optax.adam(options.discriminator_rate, b1=0.5)),
+    }
+    return optax.multi_transform(sides, Networks("agent", "agent", "agent", "critic", "critic"))
+
+
+def train_step(learner: Learner, state: TrainState, expert: Demonstration) -> tuple[TrainState, dict[str, Array]]:
+    """One update of one seed; `expert` holds all demonstrations. Returns the next state and what to log."""
+    draw, types, play, extra = random.split(random.fold_in(random.key(state.seed), state.update), 4)
+    rows = random.randint(draw, (learner.batch,), 0, jax.tree.leaves(expert)[0].shape[0])
+    batch = jax.tree.map(lambda x: x[rows], expert)
+    held = learner.agent(lax.stop_gradient(state.networks))
+    tracks, alive, pull = play_together(learner, held, batch, infer(learner, held, batch, types), play)
+
+    def total(networks: Networks, tracks: Trajectory | None) -> tuple[Array, dict[str, Array]]:
+        agent = learner.agent(networks)
+        lost = branch_losses(learner, agent, batch, infer(learner, agent, batch, types), tracks, alive, extra)
+        critic, seen = critic_loss(learner, agent, batch, tracks, alive)
+        return learner.weights.total(lost, state.update) + critic, lost | seen
+
+    (gradient, through), report = jax.grad(total, argnums=(0, 1), has_aux=True)(state.networks, tracks)
+    if tracks is not None:
+        cotangents, guarded = guard(pull(through), alive, learner.optimiser.trajectory_clip)
+
+        def along(networks: Networks) -> Array:
+            agent = learner.agent(networks)
+            g = joined_types(learner, infer(learner, agent, batch, types))
+            return jnp.sum(cotangents * jax.vmap(agent.policy_outputs)(tracks.observations[:, :-1], g))
+
+        gradient = jax.tree.map(jnp.add, gradient, jax.grad(along)(state.networks))
+        report |= guarded
+    step, optimiser = transformation(learner).update(gradient, state.optimiser, state.networks)
+    report |= {"gradient_norm": optax.tree.norm(gradient.policy)}
+    return TrainState(optax.apply_updates(state.networks, step), optimiser, state.seed, state.update + 1), report
+
+
+def infer(learner: Learner, agent: Agent, batch: Demonstration, key: Array) -> list[Typed]:
+    """Types of each branch, for its rows of the minibatch."""
+    typed = []
+    for branch, branch_key in zip(learner.method.branches, random.split(key, len(learner.method.branches)), strict=True):
+        mine = jax.tree.map(lambda x, rows=learner.rows(branch): x[rows], batch)
+        keys = random.split(branch_key, len(jax.tree.leaves(mine)[0]))
+        typed.append(jax.vmap(functools.partial(SOURCES[branch.types], agent))(mine, keys))
+    return typed
+
+
+def joined_types(learner: Learner, typed: list[Typed]) -> Float[Array, "rows size"]:
+    """Types of all rollouts of an update, branch after branch."""
+    return jnp.concatenate([t.agent_type for b, t in zip(learner.method.branches, typed, strict=True) if b.closed_loop])
+
+
+Pull = Callable[[Trajectory], Float[Array, "rows steps outputs"]]
+
+
+def play_together(
+    learner: Learner, agent: Agent, batch: Demonstration, typed: list[Typed], key: Array
+) -> tuple[Trajectory | None, Array, Pull]:
+    """The rollouts of all closed-loop branches, in one simulation.
+
+    Returns:
+        Trajectories, those that are not finite set to zero; which are finite; and the function from the gradient by them
+        to that by the policy's outputs at each step. Without a closed-loop branch there are no trajectories.
+    """
+    rows = [np.arange(learner.batch)[learner.rows(b)] for b in learner.method.branches if b.closed_loop]
+    if not rows:
+        return None, jnp.ones(0, bool), lambda tracks: tracks.actions
+    episodes = jax.tree.map(lambda x: x[np.concatenate(rows)], batch.episode)
+    g = joined_types(learner, typed)
+    keys = random.split(key, len(g))
+
+    def play(nudge: Array) -> Trajectory:
+        return jax.vmap(functools.partial(learner.play, agent))(episodes, g, keys, nudge)
+
+    tracks, back = jax.vjp(play, jnp.zeros((len(g), learner.scene.steps, agent.outputs)))
+    finite = [jnp.all(jnp.isfinite(x), axis=tuple(range(1, x.ndim))) for x in jax.tree.leaves(tracks)]
+    alive = functools.reduce(jnp.logical_and, finite)
+    return _only(alive, tracks), alive, lambda gradient: back(gradient)[0]
+
+
+def branch_losses(
+    learner: Learner, agent: Agent, batch: Demonstration, typed: list[Typed], tracks: Trajectory | None, alive: Array, key: Array
+) -> dict[str, Array]:
+    """Each loss as the sum over branches of its mean over the branch's rows (its rollouts that are finite, if it reads them)."""
+    sums: dict[str, Array] = {}
+    first = 0
+    for branch, types in zip(learner.method.branches, typed, strict=True):
+        mine = jax.tree.map(lambda x, rows=learner.rows(branch): x[rows], batch)
+        count = len(types.agent_type)
+        played, counts = None, jnp.ones(count, bool)
+        if branch.closed_loop:
+            played, counts = jax.tree.map(lambda x, a=first, n=count: x[a : a + n], (tracks, alive))
+            first += count
+        cases = Case(mine, types, played, random.split(key, count))
+        for name in branch.losses:
+            each = jax.vmap(lambda case, loss=LOSSES[name]: loss(agent, case, learner.weights))(cases)
+            sums[name] = sums.get(name, 0.0) + _mean(each, counts if name in CLOSED_LOOP else jnp.ones(count, bool))
+    return sums
+
+
+def critic_loss(
+    learner: Learner, agent: Agent, batch: Demonstration, tracks: Trajectory | None, alive: Array
+) -> tuple[Array, dict[str, Array]]:
+    """The discriminator's loss on the minibatch's demonstrations and on the rollouts of all branches, with its accuracies."""
+    if agent.networks.discriminator is None or tracks is None:
+        return jnp.zeros(()), {}
+    real, fake = (lax.stop_gradient((t.observations[:, :-1], t.actions)) for t in (batch.trajectory, tracks))
+    real_logit, fake_logit = jax.vmap(agent.logit)(*real), jax.vmap(agent.logit)(*fake)
+    entropy = jnp.mean(jax.nn.softplus(-real_logit)) + _mean(jnp.mean(jax.nn.softplus(fake_logit), axis=1), alive)
+    penalty = gradient_penalty(agent, *real)
+    report = {
+        "discriminator": entropy,
+        "discriminator_penalty": penalty,
+        "accuracy_expert": jnp.mean(real_logit > 0),
+        "accuracy_policy": _mean(jnp.mean(fake_logit < 0, axis=1), alive),
+    }
+    return entropy + learner.weights.discriminator_penalty * penalty, report
+
+
+def guard(gradient: Array, alive: Array, largest: float) -> tuple[Array, dict[str, Array]]:
+    """Clips each trajectory's gradient to norm `largest` / rows; one that is not finite is dropped and counted."""
+    norms = jnp.sqrt(jnp.sum(gradient**2, axis=(1, 2))) * len(gradient)
+    good = alive & jnp.isfinite(norms)
+    safe = jnp.where(good, norms, 0.0)
+    factor = jnp.minimum(1.0, largest / jnp.maximum(safe, 1e-12))
+    report = {
+        "trajectory_gradient": _mean(safe, good),
+        "trajectories_clipped": jnp.mean(safe > largest),
+        "trajectories_dropped": jnp.sum(~good),
+    }
+    return _only(good, gradient) * factor[:, None, None], report
+
+
+def _only(kept: Array, tree: Any) -> Any:
+    return jax.tree.map(lambda x: jnp.where(kept.reshape(-1, *[1] * (x.ndim - 1)), x, 0), tree)
+
+
+def _mean(values: Array, counts: Array) -> Array:
+    return jnp.sum(jnp.where(counts, values, 0)) / jnp.maximum(1, jnp.sum(counts))

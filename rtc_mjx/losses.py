@@ -1,0 +1,130 @@
+"""The losses: each a pure function of one trajectory. Its weight is the field of the same name in `LossWeights`.
+
+tau: the demonstration; tau_hat: the rollout in the same episode under the type g; l(s,a): the discriminator's logit for "expert".
+The sign of the adversarial loss is the one that makes sense of the paper's eq. 1 to 3: the policy *raises* P(expert).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from rtc_mjx import distributions
+from rtc_mjx.agent_types import Typed
+from rtc_mjx.models import Agent
+from rtc_mjx.pytree import pytree
+from rtc_mjx.trajectory import Demonstration, Trajectory
+
+KlDirection = Literal["posterior_prior", "prior_posterior"]
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Weight of each loss; those a method does not have are not used.
+
+    Attributes:
+        cloning: behaviour cloning on the demonstration.
+        reconstruction: the paper's L_rec.
+        adversarial: the paper's lambda.
+        adversarial_ramp: updates over which lambda rises linearly from zero.
+        type_kl: the paper's beta.
+        type_info: InfoMGAIL's mutual-information term.
+        type_nll: Symphony's label likelihood under its prior.
+        discriminator_penalty: R1 gradient penalty of the discriminator.
+        kl_direction: which KL; 'posterior_prior' is E KL[e||p], 'prior_posterior' the paper's literal E KL[p||e].
+    """
+
+    cloning: float = 1.0
+    reconstruction: float = 1.0
+    adversarial: float = 0.3
+    adversarial_ramp: int = 1000
+    type_kl: float = 0.01
+    type_info: float = 0.1
+    type_nll: float = 1.0
+    discriminator_penalty: float = 0.1
+    kl_direction: KlDirection = "posterior_prior"
+
+    def total(self, losses: dict[str, Array], update: Array) -> Array:
+        """The weighted sum at an update, lambda ramped."""
+        ramp = jnp.minimum(1.0, (update + 1) / max(1, self.adversarial_ramp))
+        return sum((getattr(self, n) * x * (ramp if n == "adversarial" else 1.0) for n, x in losses.items()), jnp.zeros(()))
+
+
+@pytree
+class Case:
+    """What the losses of one branch see of one episode.
+
+    Attributes:
+        demonstration: tau and its episode.
+        typed: g and where it came from.
+        rollout: tau_hat, or None where no loss of the branch reads it.
+        key: for losses that draw.
+    """
+
+    demonstration: Demonstration
+    typed: Typed
+    rollout: Trajectory | None
+    key: Array
+
+
+Loss = Callable[[Agent, Case, LossWeights], Array]
+
+
+def cloning(agent: Agent, case: Case, weights: LossWeights) -> Array:
+    """-mean_t log pi(a_t | s_t, g) on the demonstration."""
+    track = case.demonstration.trajectory
+    outputs = agent.policy_outputs(track.observations[:-1], case.typed.agent_type)
+    return -jnp.mean(agent.action_distribution(outputs).log_prob(track.actions))
+
+
+def reconstruction(agent: Agent, case: Case, weights: LossWeights) -> Array:
+    """L_rec(tau, tau_hat): here -mean_t log pi(a_t | s_t, g_e) on the demonstration's states (paper, section V-A)."""
+    return cloning(agent, case, weights)
+
+
+def adversarial(agent: Agent, case: Case, weights: LossWeights) -> Array:
+    """L_adv(tau_hat) = mean_t softplus(-l(s_t, a_t)): falls as the rollout looks more like the expert (paper, eq. 1)."""
+    critic = lax.stop_gradient(agent.networks.discriminator)  # D is fixed here: it has its own loss
+    logit = critic(agent.pair(case.rollout.observations[:-1], case.rollout.actions))[..., 0]
+    return jnp.mean(jax.nn.softplus(-logit))
+
+
+def type_kl(agent: Agent, case: Case, weights: LossWeights) -> Array:
+    """L_kl: KL[e(g|tau) || p(g)], whose minimiser over p is the marginal of the encoder; or the paper's literal KL[p || e]."""
+    prior, posterior = agent.prior(), case.typed.posterior
+    if weights.kl_direction == "posterior_prior":
+        return distributions.kl(posterior, prior, case.typed.agent_type)
+    return distributions.kl(prior, posterior, prior.sample(prior.noise(case.key)))
+
+
+def type_info(agent: Agent, case: Case, weights: LossWeights) -> Array:
+    """-mean_t log Q(g | s_t, a_t) over the rollout (InfoGAIL, eq. 2): policy and Q both lower it."""
+    outputs = agent.inference_outputs(case.rollout.observations[:-1], case.rollout.actions)
+    return -jnp.mean(agent.space.inference(outputs).log_prob(case.typed.agent_type))
+
+
+def type_nll(agent: Agent, case: Case, weights: LossWeights) -> Array:
+    """-log p(label): Symphony's prior over its hand-made types, trained by cross-entropy."""
+    return -agent.prior().log_prob(case.typed.agent_type)
+
+
+LOSSES: dict[str, Loss] = {
+    "cloning": cloning,
+    "reconstruction": reconstruction,
+    "adversarial": adversarial,
+    "type_kl": type_kl,
+    "type_info": type_info,
+    "type_nll": type_nll,
+}
+CLOSED_LOOP = frozenset({"adversarial", "type_info"})  # losses that read the rollout
+
+
+def gradient_penalty(agent: Agent, observations: Array, actions: Array) -> Array:
+    """R1: mean squared norm of the logit's gradient with respect to the standardised inputs, on the expert's pairs."""
+    pairs = agent.pair(observations, actions)
+    slope = jax.grad(lambda x: jnp.sum(agent.networks.discriminator(x)))(pairs)
+    return jnp.mean(jnp.sum(slope**2, axis=-1))

@@ -1,0 +1,114 @@
+"""The methods, as data: which types a branch acts under, and what it loses (method notes, section 3).
+
+A branch takes a slice of each minibatch. Slices may overlap: InfoMGAIL clones and plays every episode, under different types;
+RTC splits the minibatch at `encoder_share`, the paper's f. No method is compared by name anywhere.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from rtc_mjx.agent_types import Continuous, Discrete, NoType, TypeSpace
+from rtc_mjx.errors import UsageError
+from rtc_mjx.losses import CLOSED_LOOP
+from rtc_mjx.models import ModelOptions
+
+Share = Literal["all", "encoder_share", "rest"]
+
+
+@dataclass(frozen=True)
+class Branch:
+    """One way in which a method uses a part of the minibatch.
+
+    Attributes:
+        types: key of `agent_types.SOURCES`.
+        losses: keys of `losses.LOSSES`.
+        share: all of the minibatch, its first `encoder_share`, or what that leaves.
+    """
+
+    types: str
+    losses: tuple[str, ...]
+    share: Share = "all"
+
+    @property
+    def closed_loop(self) -> bool:
+        """Whether a loss reads a rollout."""
+        return bool(CLOSED_LOOP & set(self.losses))
+
+    def rows(self, batch: int, encoder_share: float) -> slice:
+        """The rows of the minibatch that this branch takes."""
+        split = round(batch * encoder_share)
+        return {"all": slice(0, batch), "encoder_share": slice(0, split), "rest": slice(split, batch)}[self.share]
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method.
+
+    Attributes:
+        branches: what it does with a minibatch.
+        kind: of its types.
+        test_types: where a type comes from when the agent is on its own.
+    """
+
+    branches: tuple[Branch, ...]
+    kind: Literal["none", "continuous", "discrete", "label"] = "none"
+    test_types: str = "none"
+
+    @property
+    def parts(self) -> frozenset[str]:
+        """The networks it has beside the policy."""
+        by_source = {"encoder": {"encoder", "prior"}, "prior": {"prior"}, "inference": {"inference"}, "label": {"prior"}}
+        by_loss = {"adversarial": {"discriminator"}}
+        used = [by_source.get(b.types, set()) for b in self.branches] + [by_loss.get(x, set()) for b in self.branches for x in b.losses]
+        return frozenset().union(*used)
+
+    @property
+    def encodes(self) -> bool:
+        """Whether types are inferred from demonstrations, so that paired and shuffled types mean something."""
+        return "encoder" in self.parts
+
+    def space(self, options: ModelOptions, labels: int = 0) -> TypeSpace:
+        """The space of its types; `labels`: how many the scene's hand-made types are."""
+        spaces: dict[str, TypeSpace] = {
+            "none": NoType(),
+            "continuous": Continuous(options.type_size, options.prior_components),
+            "discrete": Discrete(options.type_count),
+            "label": Discrete(labels),
+        }
+        return spaces[self.kind]
+
+
+CLONE, PLAY = ("cloning",), ("adversarial",)
+ENCODED = ("reconstruction", "type_kl", "adversarial")
+
+BC = Method((Branch("none", CLONE),))
+MGAIL = Method((Branch("none", CLONE + PLAY),))
+INFO_MGAIL = Method((Branch("inference", CLONE), Branch("fixed_prior", (*PLAY, "type_info"))), test_types="fixed_prior")
+SYMPHONY = Method((Branch("label", (*CLONE, *PLAY, "type_nll")),), kind="label", test_types="prior")
+NAIVE_HIERARCHY = Method((Branch("encoder", ENCODED),), test_types="prior")
+RTC = Method((Branch("encoder", ENCODED, "encoder_share"), Branch("prior", PLAY, "rest")), test_types="prior")
+
+METHODS: Mapping[str, Method] = {
+    "bc": BC,
+    "mgail": MGAIL,
+    "info_mgail_c": replace(INFO_MGAIL, kind="continuous"),
+    "info_mgail_d": replace(INFO_MGAIL, kind="discrete"),
+    "symphony": SYMPHONY,
+    "naive_hierarchy_c": replace(NAIVE_HIERARCHY, kind="continuous"),
+    "naive_hierarchy_d": replace(NAIVE_HIERARCHY, kind="discrete"),
+    "rtc_c": replace(RTC, kind="continuous"),
+    "rtc_d": replace(RTC, kind="discrete"),
+}
+
+
+def method_name(given: str) -> str:
+    """The full name of a method; a name without _c or _d means continuous types.
+
+    Raises:
+        UsageError: there is no such method; the message lists those there are.
+    """
+    for name in (given, f"{given}_c"):
+        if name in METHODS:
+            return name
+    raise UsageError(f"--method {given}: no such method; there are {', '.join(METHODS)} ('rtc' alone means rtc_c)")

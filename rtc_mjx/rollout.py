@@ -1,0 +1,65 @@
+"""The one loop in which anybody acts: experts, policies and replays (`Actor`) in an episode of a scene.
+
+A rollout is a deterministic, differentiable function of the actor, the episode and the noise drawn beforehand.
+"""
+
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from rtc_mjx.physics import OneStep, PhysicsState, control_step, specialised_step
+from rtc_mjx.scenes import Actor, Scene
+from rtc_mjx.trajectory import Episode, Trajectory
+
+GradientMode = Literal["full", "dynamics_only", "none"]
+
+
+def rollout(
+    scene: Scene,
+    actor: Actor,
+    episode: Episode,
+    *,
+    gradient: GradientMode = "full",
+    decay: float = 1.0,
+    one_step: OneStep | None = None,
+) -> Trajectory:
+    """Lets an actor live one episode.
+
+    Args:
+        scene: where.
+        actor: who, with the noise of all T steps.
+        episode: s_0 and xi.
+        gradient: what a backward pass follows from step to step: everything ('full'), the physics but not what the actor
+            saw ('dynamics_only'), or nothing ('none'). Values are the same.
+        decay: the backward signal shrinks by this factor at every step back in time; values are the same.
+        one_step: physics in place of the scene's own, such as hand-written equations.
+    """
+    advance = control_step(scene.world, scene.substeps, one_step or specialised_step(scene.world))
+
+    def see(time: jax.Array, state: PhysicsState) -> jax.Array:
+        seen = scene.observe(episode, time, state)
+        return seen if gradient == "full" else lax.stop_gradient(seen)
+
+    def body(carry, inputs):  # type: ignore[no-untyped-def]  # scan's carry is any pytree
+        memory, state = carry
+        time, around, noise = inputs
+        seen = see(time, state)
+        memory, action = actor.act(memory, seen, noise)
+        after = advance(damp(state, 0.0 if gradient == "none" else decay), action, around)
+        return (memory, after), (state, seen, action)
+
+    during = jax.tree.map(lambda x: x[:-1], episode.surroundings)
+    inputs = (jnp.arange(scene.steps), during, actor.noise)
+    (_, last), (states, seen, actions) = lax.scan(body, (actor.memory, episode.start), inputs)
+    end = see(jnp.array(scene.steps), last)
+    states, seen = jax.tree.map(lambda xs, x: jnp.concatenate([xs, x[None]]), (states, seen), (last, end))
+    return Trajectory(states, seen, actions)
+
+
+def damp(state: PhysicsState, factor: float) -> PhysicsState:
+    """The same values; what flows back through them is multiplied by `factor`."""
+    if factor == 1.0:
+        return state
+    return jax.tree.map(lambda x: factor * x + lax.stop_gradient((1 - factor) * x), state)

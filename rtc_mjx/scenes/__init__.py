@@ -1,0 +1,21 @@
+"""Scenes: what happens in a world. Adding one takes a file here, an MJCF file if the world is new, and a line in `SCENES`."""
+
+from rtc_mjx.errors import UsageError
+from rtc_mjx.scenes.base import Actor, Scene
+from rtc_mjx.scenes.double_goal import DoubleGoal
+
+SCENES: dict[str, type[Scene]] = {"double_goal": DoubleGoal}
+
+
+def scene_type(name: str) -> type[Scene]:
+    """The scene of a name.
+
+    Raises:
+        UsageError: there is none; the message lists those there are.
+    """
+    if name not in SCENES:
+        raise UsageError(f"--scene {name}: no such scene; there are {', '.join(SCENES)}")
+    return SCENES[name]
+
+
+__all__ = ["SCENES", "Actor", "DoubleGoal", "Scene", "scene_type"]

@@ -1,0 +1,84 @@
+"""What every scene offers, in the order in which an episode is lived: reset, observe, expert, label, features, metrics.
+
+A scene is a frozen dataclass of settings; its methods are pure functions of one episode. The world (an MJCF file) holds the
+physics, the scene says what happens in it.
+"""
+
+import abc
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from rtc_mjx.physics import PhysicsState, World
+from rtc_mjx.trajectory import Episode, Trajectory
+
+Act = Callable[[Any, Array, Any], tuple[Any, Array]]  # (memory, observation, noise of one step) -> (memory, action)
+
+
+@dataclass(frozen=True)
+class Actor:
+    """Someone who acts in a rollout: an expert, a policy under one type, a replay.
+
+    Attributes:
+        memory: what the actor carries from step to step, at the start; any pytree.
+        act: (memory, observation, noise of the step) -> (memory, action).
+        noise: the pre-drawn noise, leading axis T; a rollout is a deterministic function of it.
+    """
+
+    memory: Any
+    act: Act
+    noise: Any
+
+
+@dataclass(frozen=True)
+class Scene(abc.ABC):
+    """Base of all scenes; subclasses add their settings as fields.
+
+    Attributes:
+        steps: T, the number of control steps in an episode.
+    """
+
+    name: ClassVar[str]
+    substeps: ClassVar[int] = 1
+    main_metrics: ClassVar[tuple[str, ...]] = ()
+    labels: ClassVar[int] = 0  # how many hand-made types there are (Symphony)
+    steps: int = field(default=60)
+
+    @functools.cached_property
+    @abc.abstractmethod
+    def world(self) -> World:
+        """The physics of the scene."""
+
+    @property
+    def control_range(self) -> Float[np.ndarray, "controls 2"]:
+        """Lowest and highest value of each control."""
+        return np.asarray(self.world.mj.actuator_ctrlrange[list(self.world.control_ids)])
+
+    @abc.abstractmethod
+    def reset(self, key: jax.Array) -> Episode:
+        """Draws s_0 and xi."""
+
+    @abc.abstractmethod
+    def observe(self, episode: Episode, time: Array, state: PhysicsState) -> Float[Array, "features"]:
+        """What an actor sees at control step `time` (0 to T)."""
+
+    @abc.abstractmethod
+    def expert(self, key: jax.Array, episode: Episode) -> tuple[Actor, Any]:
+        """An expert for the episode, and its internal truth (for analysis only)."""
+
+    @abc.abstractmethod
+    def label(self, trajectory: Trajectory) -> Array | None:
+        """Symphony's hand-made type of a demonstration as a one-hot vector; None where the scene has none."""
+
+    @abc.abstractmethod
+    def features(self, episode: Episode, trajectory: Trajectory) -> dict[str, Array]:
+        """The numbers of one trajectory that metrics compare between populations."""
+
+    @abc.abstractmethod
+    def metrics(self, features: dict[str, np.ndarray], expert: dict[str, np.ndarray]) -> dict[str, float]:
+        """The scene's metrics of one population of trajectories against the expert's."""

@@ -1,0 +1,144 @@
+"""Trains a method on a scene: `python -m rtc_mjx.train --scene double_goal --method rtc`.
+
+    settings -> demonstrations -> state (resumed or new) -> chunks of updates, all seeds in one program -> metrics, checkpoints
+
+All randomness is a function of seed and update, and what happens at an update does not depend on where the run was resumed: a
+run that was killed and resumed writes the same metrics.jsonl (but for wall_s) as one that was not.
+"""
+
+import functools
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import random
+
+from rtc_mjx import cache, cli, config, dataset, evaluate
+from rtc_mjx.config import Config
+from rtc_mjx.learner import Learner, TrainState, start, train_step
+from rtc_mjx.progress import Reporter
+from rtc_mjx.runs import Run
+from rtc_mjx.trajectory import Demonstration
+
+Chunk = Callable[[TrainState, Demonstration], tuple[TrainState, dict[str, jax.Array]]]
+
+
+def train(config: Config) -> Run:
+    """Trains, or goes on training; returns the run.
+
+    Raises:
+        UsageError: the run directory cannot be used.
+        RunError: a checkpoint could not be written.
+        KeyboardInterrupt: interrupted; a checkpoint was saved first.
+    """
+    run = Run.open(config.folder) if config.resume else Run.create(config)
+    expert = dataset.demonstrations(config.scene, config.experts.train, evaluate.TRAIN_DATA)
+    learner = evaluate.learner_for(config, expert)
+    state, update, before = begin(run, learner, config)
+    test = Tests(config, learner)
+    chunk, data = compiled_chunk(learner, config.every.log), evaluate.without_truth(expert)
+    started = time.perf_counter() - before
+    with Reporter(run, config, update) as report, Interruption() as interrupted:
+        while update < config.updates:
+            state, seen = chunk(state, data)
+            update += config.every.log
+            line = {"update": update, "wall_s": time.perf_counter() - started, "env_steps": env_steps(learner, update)}
+            line |= as_lists(seen)
+            if update % config.every.test == 0 or update >= config.updates:
+                line |= test(state)
+            report(line)
+            if update % config.every.save == 0 or update >= config.updates or interrupted:
+                run.save(update, state, line["wall_s"])
+            if interrupted:
+                raise KeyboardInterrupt
+    return run
+
+
+def begin(run: Run, learner: Learner, config: Config) -> tuple[TrainState, int, float]:
+    """The state to go on from, its update, and the seconds spent before."""
+    make = jax.vmap(functools.partial(start, learner))
+    if not (config.resume and any(run.checkpoints())):
+        run.rewind(0)
+        return jax.jit(make)(evaluate.seeds_of(config)), 0, 0.0
+    update, state, wall = run.restore(jax.eval_shape(make, evaluate.seeds_of(config)))
+    run.rewind(update)
+    run.discard_after(update)
+    return state, update, wall
+
+
+def compiled_chunk(learner: Learner, length: int) -> Chunk:
+    """`length` updates of all seeds as one program; returns the means of what the updates report."""
+
+    def one_seed(state: TrainState, expert: Demonstration) -> tuple[TrainState, dict[str, jax.Array]]:
+        state, seen = jax.lax.scan(lambda s, _: train_step(learner, s, expert), state, length=length)
+        return state, jax.tree.map(jnp.mean, seen)
+
+    return jax.jit(jax.vmap(one_seed, in_axes=(0, None)), donate_argnums=0)
+
+
+class Tests:
+    """The scene's metrics on test episodes, under every source of types."""
+
+    def __init__(self, config: Config, learner: Learner) -> None:
+        self.config, self.roll = config, evaluate.roller(learner)
+        demonstrations = dataset.demonstrations(config.scene, config.experts.test, evaluate.TEST_DATA)
+        self.expert = evaluate.expert_features(config, demonstrations)
+        self.episodes = evaluate.without_truth(demonstrations)
+
+    def __call__(self, state: TrainState) -> dict[str, list[float]]:
+        """Metrics by name; those under other types than the prior's are prefixed."""
+        features = jax.device_get(self.roll(state.networks, self.episodes, random.key(evaluate.NOISE)))
+        scores = evaluate.score(self.config, features, self.expert)
+        named = {source: f"{source}/" if source != "prior" else "" for source in scores}
+        return {named[source] + name: values for source, table in scores.items() for name, values in table.items()}
+
+
+def env_steps(learner: Learner, update: int) -> int:
+    """Control steps simulated by one seed in so many updates."""
+    rows = [learner.rows(b) for b in learner.method.branches if b.closed_loop]
+    return update * learner.scene.steps * sum(r.stop - r.start for r in rows)
+
+
+def as_lists(seen: dict[str, jax.Array]) -> dict[str, list[float]]:
+    """Numbers per seed, in the order of their names."""
+    return {name: [float(x) for x in values] for name, values in sorted(jax.device_get(seen).items())}
+
+
+class Interruption:
+    """While open, Ctrl-C and a request to terminate are noted, so that the chunk under way can end and be saved."""
+
+    def __init__(self) -> None:
+        self.noted = False
+
+    def __bool__(self) -> bool:
+        return self.noted
+
+    def __enter__(self) -> "Interruption":
+        def note(number: int, frame: Any) -> None:
+            if self.noted:
+                raise KeyboardInterrupt  # a second one does not wait
+            self.noted = True
+
+        self.before = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self.before.items():
+            signal.signal(number, handler)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Trains as the command line says, then evaluates."""
+    argv = sys.argv[1:] if argv is None else argv
+    settings = config.from_command_line(argv, "python -m rtc_mjx.train")
+    cache.keep_compiled()
+    run = train(settings)
+    evaluate.main(["--run", str(run.folder)])
+
+
+if __name__ == "__main__":
+    cli.run(main)
