@@ -8,11 +8,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
 from rtc_mjx.distributions import Distribution, Gaussian, GaussianMixture, OneHot
+from rtc_mjx.errors import UsageError
 from rtc_mjx.pytree import pytree
 
 if TYPE_CHECKING:
@@ -23,9 +25,11 @@ SMALLEST_SCALE = 0.05  # of a Gaussian type: a narrower posterior would let dens
 
 
 class TypeSpace(Protocol):
-    """A space of types; `size` is the length of a type vector."""
+    """A space of types."""
 
-    size: int
+    @property
+    def size(self) -> int:
+        """Length of a type vector."""
 
     @property
     def posterior_outputs(self) -> int:
@@ -40,6 +44,9 @@ class TypeSpace(Protocol):
 
     def inference(self, outputs: Array) -> Distribution:
         """InfoMGAIL's Q(g|s,a); continuous: of unit sigma, since a learned one makes the objective unbounded."""
+
+    def pooled(self, outputs: Array) -> Distribution:
+        """What a whole trajectory says of the type, by Q's outputs at each of its steps (leading axis)."""
 
     def prior(self, outputs: Array) -> Distribution:
         """The learned prior."""
@@ -60,7 +67,7 @@ class NoType:
         """Nothing to infer."""
         return Gaussian(jnp.zeros(0), jnp.ones(0))
 
-    inference = prior = posterior
+    inference = pooled = prior = posterior
 
     def fixed_prior(self) -> Gaussian:
         """Nothing to draw."""
@@ -99,6 +106,11 @@ class Continuous:
         mean, _ = jnp.split(outputs, 2, axis=-1)
         return Gaussian(mean, jnp.ones_like(mean))
 
+    def pooled(self, outputs: Array) -> Gaussian:
+        """As many unit-scale observations of the type as there are steps: their mean, and its standard error."""
+        mean, _ = jnp.split(outputs, 2, axis=-1)
+        return Gaussian(jnp.mean(mean, axis=0), jnp.full(self.size, len(outputs) ** -0.5))
+
     def prior(self, outputs: Array) -> GaussianMixture:
         """The mixture."""
         return mixture_of(outputs, self.components, self.size, SMALLEST_SCALE)
@@ -133,6 +145,10 @@ class Discrete:
         return OneHot(outputs)
 
     inference = prior = posterior
+
+    def pooled(self, outputs: Array) -> OneHot:
+        """Independent evidence multiplies: the sum of the log-probabilities of all steps."""
+        return OneHot(jnp.sum(jax.nn.log_softmax(outputs), axis=0))
 
     def fixed_prior(self) -> OneHot:
         """All categories alike."""
@@ -193,20 +209,24 @@ def from_encoder(agent: "Agent", demonstration: "Demonstration", key: Array) -> 
 def from_inference(agent: "Agent", demonstration: "Demonstration", key: Array) -> Typed:
     """InfoMGAIL's cloning: the type that Q itself reads off the demonstration, held fixed.
 
-    A randomly paired type would teach the policy to ignore types. Q sees one step at a time; evidence is averaged over steps.
+    A randomly paired type would teach the policy to ignore types. Q sees one step at a time: `pooled` puts the steps together.
     """
     track = demonstration.trajectory
     seen = agent.inference_outputs(track.observations[:-1], track.actions)
-    inferred = agent.space.posterior(jnp.mean(seen, axis=0))
-    if isinstance(inferred, OneHot):
-        inferred = agent.space.posterior(jnp.sum(seen, axis=0))  # independent evidence multiplies
-        return Typed(lax.stop_gradient(inferred.sample(inferred.noise(key))), None)
-    return Typed(lax.stop_gradient(agent.space.inference(jnp.mean(seen, axis=0)).mean), None)
+    inferred = agent.space.pooled(seen)
+    return Typed(lax.stop_gradient(inferred.sample(inferred.noise(key))), None)
 
 
 def from_label(agent: "Agent", demonstration: "Demonstration", key: Array) -> Typed:
-    """Symphony: the hand-made label of the demonstration."""
-    return Typed(agent.scene.label(demonstration.trajectory), None)
+    """Symphony: the hand-made label of the demonstration.
+
+    Raises:
+        UsageError: the scene has none.
+    """
+    label = agent.scene.label(demonstration.trajectory)
+    if label is None:
+        raise UsageError(f"scene {agent.scene.name} has no hand-made labels")
+    return Typed(label, None)
 
 
 SOURCES: dict[str, Source] = {

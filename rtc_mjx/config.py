@@ -99,11 +99,19 @@ class Config:
 
 
 LEAST = {
-    "seeds": 1, "first_seed": 0, "updates": 1, "batch": 4, "model.width": 1, "model.depth": 1, "model.mixture": 1, "model.type_size": 1,
-    "model.type_count": 2, "model.prior_components": 1, "losses.adversarial_ramp": 0, "experts.train": 4, "experts.test": 4,
+    "seeds": 1, "first_seed": 0, "updates": 1, "batch": 4,
+    "model.width": 1, "model.depth": 1, "model.mixture": 1, "model.type_size": 1, "model.type_count": 2, "model.prior_components": 1,
+    "losses.adversarial_ramp": 0, "losses.type_kl_ramp": 0, "experts.train": 4, "experts.test": 4,
     "every.log": 1, "every.test": 1, "every.save": 1, "scene.steps": 1,
 }  # fmt: skip
-POSITIVE = ("model.smallest_scale", "optimiser.learning_rate", "optimiser.discriminator_rate", "optimiser.clip", "optimiser.trajectory_clip")
+POSITIVE = (
+    "model.smallest_scale",
+    "optimiser.learning_rate",
+    "optimiser.prior_rate",
+    "optimiser.discriminator_rate",
+    "optimiser.clip",
+    "optimiser.trajectory_clip",
+)
 NOT_NEGATIVE = tuple(f"losses.{f.name}" for f in dataclasses.fields(LossWeights) if f.type is float or f.type == "float")
 SHARES = ("encoder_share", "optimiser.final_rate", "optimiser.decay", "scene.lower_probability")
 
@@ -168,7 +176,9 @@ def _resumed(given: argparse.Namespace, argv: list[str], prog: str) -> Config:
     ours, theirs = flat(to_dict(wanted)), flat(to_dict(held))
     for name in ours:
         if ours[name] != theirs[name] and name not in ("run", "resume"):
-            raise UsageError(f"--{name} {ours[name]}: the run in {folder} has {theirs[name]}; resume without the option, or start a new run")
+            raise UsageError(
+                f"--{name} {ours[name]}: the run in {folder} has {theirs[name]}; resume without the option, or start a new run"
+            )
     return wanted
 
 
@@ -184,7 +194,7 @@ def _without(argv: Sequence[str], *options: str) -> list[str]:
 
 
 def _parse(config: Config, argv: list[str], prog: str) -> Config:
-    """tyro's parse; its boxed messages become one line."""
+    """Tyro's parse; its boxed messages become one line."""
     told = io.StringIO()
     try:
         with contextlib.redirect_stderr(told):

@@ -7,6 +7,7 @@ import json
 import os
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -65,7 +66,7 @@ def fingerprint(scene: Scene, count: int, seed: int) -> str:
 def statistics(expert: Demonstration) -> Statistics:
     """Mean and standard deviation of the expert's observations and actions over episodes and time."""
 
-    def moments(x: np.ndarray) -> tuple[jax.Array, jax.Array]:
+    def moments(x: Any) -> tuple[jax.Array, jax.Array]:
         flat = np.asarray(x, np.float64).reshape(-1, x.shape[-1])
         scale = flat.std(axis=0)
         return jnp.asarray(flat.mean(axis=0), jnp.float32), jnp.asarray(np.where(scale > 1e-6, scale, 1.0), jnp.float32)
@@ -76,7 +77,7 @@ def statistics(expert: Demonstration) -> Statistics:
 def _read(file: Path, shapes: list[jax.ShapeDtypeStruct]) -> list[np.ndarray] | None:
     """The arrays of a cache file; None where it is absent or damaged (it is then made again)."""
     try:
-        with np.load(file, allow_pickle=False) as held:
+        with file.open("rb") as opened, np.load(opened, allow_pickle=False) as held:
             leaves = [held[str(i)] for i in range(len(shapes))]
     except (OSError, ValueError, KeyError, EOFError, cache.DAMAGED):
         return None
@@ -88,5 +89,5 @@ def _write(file: Path, leaves: list[np.ndarray]) -> None:
     """Writes beside and renames, so that a reader or a second writer never sees half a file."""
     file.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".part", delete=False) as part:
-        np.savez(part, **{str(i): x for i, x in enumerate(leaves)})
+        np.savez(part, allow_pickle=False, **{str(i): x for i, x in enumerate(leaves)})
     os.replace(part.name, file)

@@ -48,7 +48,7 @@ class Gaussian:
         return random.normal(key, self.mean.shape)
 
     def sample(self, noise: Array) -> Array:
-        """mean + scale * noise: exact pathwise gradients."""
+        """Mean + scale * noise: exact pathwise gradients."""
         return self.mean + self.scale * noise
 
     def log_prob(self, value: Array) -> Array:

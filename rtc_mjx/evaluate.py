@@ -106,7 +106,8 @@ def score(config: Config, features: dict[str, Features], expert: Features) -> di
 
 def without_truth(demonstrations: Demonstration) -> Demonstration:
     """On the device, without what only an analysis may see."""
-    return Demonstration(*jax.tree.map(jnp.asarray, (demonstrations.episode, demonstrations.trajectory)), truth=())
+    episode, trajectory = jax.tree.map(jnp.asarray, (demonstrations.episode, demonstrations.trajectory))
+    return Demonstration(episode, trajectory, ())
 
 
 def evaluate(run: Run, episodes: int) -> dict[str, Any]:
@@ -161,7 +162,9 @@ def table(result: dict[str, Any]) -> Table:
     for name in names:
         out.add_column(name, justify="right")
     for source, summary in result["types"].items():
-        out.add_row(source, *(f"{s['mean']:.4g} ± {s['std']:.2g}  [{s['interval'][0]:.4g}, {s['interval'][1]:.4g}]" for s in summary.values()))
+        out.add_row(
+            source, *(f"{s['mean']:.4g} ± {s['std']:.2g}  [{s['interval'][0]:.4g}, {s['interval'][1]:.4g}]" for s in summary.values())
+        )
     for who, values in result["reference"].items():
         out.add_row(who.replace("_", " "), *(f"{values[name]:.4g}" for name in names))
     return out

@@ -38,7 +38,8 @@ class OptimiserOptions:
     """How gradients become updates.
 
     Attributes:
-        learning_rate: Adam's, of policy, encoder and prior; falls along a half cosine to `final_rate` of it.
+        learning_rate: Adam's, of policy and encoder; falls along a half cosine to `final_rate` of it.
+        prior_rate: Adam's, of the prior; falls alike.
         discriminator_rate: Adam's, of discriminator and Q; constant.
         final_rate: share of the learning rate left at the last update.
         clip: largest norm of an update's gradient, policy and discriminator apart.
@@ -48,6 +49,7 @@ class OptimiserOptions:
     """
 
     learning_rate: float = 1e-3
+    prior_rate: float = 3e-3
     discriminator_rate: float = 1e-3
     final_rate: float = 0.1
     clip: float = 1.0
@@ -94,6 +96,11 @@ class Learner:
         """The rows of the minibatch that a branch takes."""
         return branch.rows(self.batch, self.encoder_share)
 
+    def part(self, branch: Branch, batch: Demonstration) -> Demonstration:
+        """A branch's rows of the minibatch."""
+        rows = self.rows(branch)
+        return jax.tree.map(lambda x: x[rows], batch)
+
     def play(self, agent: Agent, episode: Episode, agent_type: Array, key: Array, nudge: Array) -> Trajectory:
         """One rollout of the policy under one type, with `nudge` (T, outputs) added to its outputs to differentiate by."""
         options, actor = self.optimiser, agent.actor(agent_type, key, nudge)
@@ -125,14 +132,21 @@ def start(learner: Learner, seed: Array) -> TrainState:
 
 
 def transformation(learner: Learner) -> optax.GradientTransformation:
-    """Adam with clipping, policy side and discriminator side apart."""
+    """Adam with clipping; policy and encoder, prior, discriminator and Q apart."""
     options = learner.optimiser
-    schedule = optax.cosine_decay_schedule(options.learning_rate, learner.updates, alpha=options.final_rate)
+
+    def adam(rate: float | optax.Schedule, b1: float = 0.9) -> optax.GradientTransformation:
+        return optax.chain(optax.clip_by_global_norm(options.clip), optax.adam(rate, b1=b1))
+
+    def falling(rate: float) -> optax.Schedule:
+        return optax.cosine_decay_schedule(rate, learner.updates, alpha=options.final_rate)
+
     sides = {
-        "agent": optax.chain(optax.clip_by_global_norm(options.clip), optax.adam(schedule)),
-        "critic": optax.chain(optax.clip_by_global_norm(options.clip), optax.adam(options.discriminator_rate, b1=0.5)),
+        "agent": adam(falling(options.learning_rate)),
+        "prior": adam(falling(options.prior_rate)),
+        "critic": adam(options.discriminator_rate, b1=0.5),
     }
-    return optax.multi_transform(sides, Networks("agent", "agent", "agent", "critic", "critic"))
+    return optax.multi_transform(sides, Networks("agent", "agent", "prior", "critic", "critic"))
 
 
 def train_step(learner: Learner, state: TrainState, expert: Demonstration) -> tuple[TrainState, dict[str, Array]]:
@@ -169,7 +183,7 @@ def infer(learner: Learner, agent: Agent, batch: Demonstration, key: Array) -> l
     """Types of each branch, for its rows of the minibatch."""
     typed = []
     for branch, branch_key in zip(learner.method.branches, random.split(key, len(learner.method.branches)), strict=True):
-        mine = jax.tree.map(lambda x, rows=learner.rows(branch): x[rows], batch)
+        mine = learner.part(branch, batch)
         keys = random.split(branch_key, len(jax.tree.leaves(mine)[0]))
         typed.append(jax.vmap(functools.partial(SOURCES[branch.types], agent))(mine, keys))
     return typed
@@ -215,7 +229,7 @@ def branch_losses(
     sums: dict[str, Array] = {}
     first = 0
     for branch, types in zip(learner.method.branches, typed, strict=True):
-        mine = jax.tree.map(lambda x, rows=learner.rows(branch): x[rows], batch)
+        mine = learner.part(branch, batch)
         count = len(types.agent_type)
         played, counts = None, jnp.ones(count, bool)
         if branch.closed_loop:

@@ -6,7 +6,7 @@ The sign of the adversarial loss is the one that makes sense of the paper's eq. 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from rtc_mjx import distributions
 from rtc_mjx.agent_types import Typed
 from rtc_mjx.models import Agent
 from rtc_mjx.pytree import pytree
-from rtc_mjx.trajectory import Demonstration, Trajectory
+from rtc_mjx.trajectory import Demonstration
 
 KlDirection = Literal["posterior_prior", "prior_posterior"]
 
@@ -32,6 +32,7 @@ class LossWeights:
         adversarial: the paper's lambda.
         adversarial_ramp: updates over which lambda rises linearly from zero.
         type_kl: the paper's beta.
+        type_kl_ramp: updates over which beta rises linearly from zero.
         type_info: InfoMGAIL's mutual-information term.
         type_nll: Symphony's label likelihood under its prior.
         discriminator_penalty: R1 gradient penalty of the discriminator.
@@ -43,15 +44,20 @@ class LossWeights:
     adversarial: float = 0.3
     adversarial_ramp: int = 1000
     type_kl: float = 0.01
+    type_kl_ramp: int = 0
     type_info: float = 0.1
     type_nll: float = 1.0
     discriminator_penalty: float = 0.1
     kl_direction: KlDirection = "posterior_prior"
 
     def total(self, losses: dict[str, Array], update: Array) -> Array:
-        """The weighted sum at an update, lambda ramped."""
-        ramp = jnp.minimum(1.0, (update + 1) / max(1, self.adversarial_ramp))
-        return sum((getattr(self, n) * x * (ramp if n == "adversarial" else 1.0) for n, x in losses.items()), jnp.zeros(()))
+        """The weighted sum at an update, lambda and beta ramped."""
+
+        def weight(name: str) -> Array | float:
+            ramp = getattr(self, f"{name}_ramp", 0)
+            return getattr(self, name) * (jnp.minimum(1.0, (update + 1) / ramp) if ramp else 1.0)
+
+        return sum((weight(name) * value for name, value in losses.items()), jnp.zeros(()))
 
 
 @pytree
@@ -61,13 +67,13 @@ class Case:
     Attributes:
         demonstration: tau and its episode.
         typed: g and where it came from.
-        rollout: tau_hat, or None where no loss of the branch reads it.
+        rollout: tau_hat, a `Trajectory`; None where no loss of the branch reads it.
         key: for losses that draw.
     """
 
     demonstration: Demonstration
     typed: Typed
-    rollout: Trajectory | None
+    rollout: Any
     key: Array
 
 

@@ -57,6 +57,7 @@ class MLP(nnx.Module):
         self.layers = nnx.List([layer(a, b, s) for a, b, s in zip(sizes[:-1], sizes[1:], scales, strict=True)])
 
     def __call__(self, x: Array) -> Array:
+        """The outputs; leading axes of `x` are batch."""
         for layer in self.layers[:-1]:
             x = jnp.tanh(layer(x))
         return self.layers[-1](x)
@@ -70,6 +71,7 @@ class Encoder(nnx.Module):
         self.head = MLP([width, *[width] * (depth - 1), outputs], rngs)
 
     def __call__(self, steps: Float[Array, "steps inputs"]) -> Float[Array, "outputs"]:
+        """The outputs for one trajectory."""
         return self.head(jnp.tanh(jnp.mean(self.step(steps), axis=0)))
 
 

@@ -36,6 +36,7 @@ def rollout(
         decay: the backward signal shrinks by this factor at every step back in time; values are the same.
         one_step: physics in place of the scene's own, such as hand-written equations.
     """
+    episode = jax.tree.map(jnp.asarray, episode)
     advance = control_step(scene.world, scene.substeps, one_step or specialised_step(scene.world))
 
     def see(time: jax.Array, state: PhysicsState) -> jax.Array:

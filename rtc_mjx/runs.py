@@ -115,7 +115,7 @@ class Run:
             try:
                 state, notes = self._read(update, like)
             except Exception as error:  # orbax and tensorstore raise bare Exceptions for damaged files
-                logging.getLogger("rtc_mjx").warning("checkpoint %d is damaged, using the one before: %s", update, _first_line(error))
+                logging.getLogger("rtc_mjx").warning("checkpoint %d cannot be read, using the one before: %s", update, _first_line(error))
                 continue
             return update, state, float(notes["wall_s"])
         raise UsageError(f"{self.folder} has no whole checkpoint; start the run again in a new directory")

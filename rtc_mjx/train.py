@@ -46,7 +46,7 @@ def train(config: Config) -> Run:
         while update < config.updates:
             state, seen = chunk(state, data)
             update += config.every.log
-            line = {"update": update, "wall_s": time.perf_counter() - started, "env_steps": env_steps(learner, update)}
+            line: dict[str, Any] = {"update": update, "wall_s": time.perf_counter() - started, "env_steps": env_steps(learner, update)}
             line |= as_lists(seen)
             if update % config.every.test == 0 or update >= config.updates:
                 line |= test(state)

@@ -77,6 +77,7 @@ class World:
 
     Attributes:
         name: what it was loaded as; error messages use it.
+        spec: what it was compiled from; rendering adds to a copy of it.
         mj: the compiled model of everything, for C MuJoCo and for rendering.
         free: what moves by itself, and among itself collides.
         one_user: the same with one replayed road user; None where no mocap body collides.
@@ -87,6 +88,7 @@ class World:
     """
 
     name: str
+    spec: mujoco.MjSpec
     mj: mujoco.MjModel
     free: Part
     one_user: Part | None
@@ -195,6 +197,7 @@ def from_spec(spec: mujoco.MjSpec, *, name: str = "model") -> World:
     control_ids = tuple(int(i) for i in range(model.nu) if np.any(model.actuator_gainprm[i]))
     return World(
         name=name,
+        spec=spec,
         mj=model,
         free=_free_part(spec, bodies),
         one_user=_one_user_part(spec, bodies) if bodies else None,

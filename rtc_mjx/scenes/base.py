@@ -1,4 +1,4 @@
-"""What every scene offers, in the order in which an episode is lived: reset, observe, expert, label, features, metrics.
+"""What every scene offers, in the order in which an episode is lived: reset, observe, reward, expert, label, features, metrics.
 
 A scene is a frozen dataclass of settings; its methods are pure functions of one episode. The world (an MJCF file) holds the
 physics, the scene says what happens in it.
@@ -46,6 +46,7 @@ class Scene(abc.ABC):
     name: ClassVar[str]
     substeps: ClassVar[int] = 1
     main_metrics: ClassVar[tuple[str, ...]] = ()
+    agent_body: ClassVar[str] = "agent"
     labels: ClassVar[int] = 0  # how many hand-made types there are (Symphony)
     steps: int = field(default=60)
 
@@ -66,6 +67,10 @@ class Scene(abc.ABC):
     @abc.abstractmethod
     def observe(self, episode: Episode, time: Array, state: PhysicsState) -> Float[Array, "features"]:
         """What an actor sees at control step `time` (0 to T)."""
+
+    @abc.abstractmethod
+    def reward(self, episode: Episode, time: Array, state: PhysicsState) -> Float[Array, ""]:
+        """What being in this state at control step `time` is worth; no method learns from it."""
 
     @abc.abstractmethod
     def expert(self, key: jax.Array, episode: Episode) -> tuple[Actor, Any]:

@@ -73,6 +73,11 @@ class DoubleGoal(Scene):
         goals = episode.surroundings.pose[time, :, :2] - state.qpos
         return jnp.concatenate([state.qpos, state.qvel, goals[LOWER], goals[UPPER], jnp.array([time / self.steps])])
 
+    def reward(self, episode: Episode, time: Array, state: PhysicsState) -> Float[Array, ""]:
+        """One in a step that ends within 0.1 m of either goal."""
+        distance = jnp.linalg.norm(state.qpos - episode.surroundings.pose[time, :, :2], axis=-1)
+        return (jnp.min(distance) < REACHED).astype(state.qpos.dtype)
+
     def expert(self, key: jax.Array, episode: Episode) -> tuple[Actor, Any]:
         """Heads for one goal on a path that bends to one side; both the goal and the bend are its own choice."""
         goals, side, size, tremor = random.split(key, 4)
@@ -92,12 +97,8 @@ class DoubleGoal(Scene):
 
     def features(self, episode: Episode, trajectory: Trajectory) -> dict[str, Array]:
         """Steps spent at either goal, and the side on which the episode ends: h = sign(y_T) (paper, section V-A)."""
-        goals = episode.surroundings.pose[1:, :, :2]
-        distance = jnp.linalg.norm(trajectory.states.qpos[1:, None] - goals, axis=-1)
-        return {
-            "return": jnp.sum(jnp.min(distance, axis=1) < REACHED),
-            "upper": (trajectory.states.qpos[-1, 1] > 0).astype(int),
-        }
+        rewards = jax.vmap(self.reward, in_axes=(None, 0, 0))(episode, jnp.arange(self.steps + 1), trajectory.states)
+        return {"return": jnp.sum(rewards[1:]), "upper": (trajectory.states.qpos[-1, 1] > 0).astype(int)}
 
     def metrics(self, features: dict[str, np.ndarray], expert: dict[str, np.ndarray]) -> dict[str, float]:
         """Mean return in steps, and the Jensen-Shannon divergence in bits of h from the expert's."""

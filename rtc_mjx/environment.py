@@ -1,0 +1,101 @@
+"""A scene as a `dm_env.Environment`, so that dm_control's viewer and any dm_env loop can live in it.
+
+Physics are MJX's, as in training; a dm_control `Physics` of the same model is kept in step, for viewers and pixels.
+"""
+
+import functools
+from typing import Any
+
+import dm_env
+import jax
+import jax.numpy as jnp
+import numpy as np
+from dm_control import mujoco as dm_mujoco
+from dm_env import specs
+
+from rtc_mjx.errors import NonFiniteError, UsageError
+from rtc_mjx.physics import PhysicsState, control_step, specialised_step
+from rtc_mjx.scenes import Scene
+from rtc_mjx.trajectory import Episode
+
+
+class Environment(dm_env.Environment):
+    """Episodes of a scene, one after another.
+
+    Args:
+        scene: which.
+        seed: of the sequence of episodes.
+    """
+
+    def __init__(self, scene: Scene, seed: int = 0) -> None:
+        self._scene, self._seed, self._count = scene, seed, 0
+        self._physics = dm_mujoco.Physics.from_model(dm_mujoco.wrapper.MjModel(scene.world.mj))
+        self._now: tuple[Episode, int, PhysicsState] | None = None
+        advance = control_step(scene.world, scene.substeps, specialised_step(scene.world))
+        self._reset = jax.jit(scene.reset)
+        self._look = jax.jit(lambda episode, time, state: (scene.observe(episode, time, state), scene.reward(episode, time, state)))
+        self._advance = jax.jit(
+            lambda episode, time, state, action: advance(state, action, jax.tree.map(lambda x: x[time], episode.surroundings))
+        )
+
+    @property
+    def physics(self) -> dm_mujoco.Physics:
+        """dm_control's view of the current state."""
+        return self._physics
+
+    def control_timestep(self) -> float:
+        """Seconds between two actions."""
+        return self._scene.substeps * self._scene.world.timestep
+
+    def reset(self) -> dm_env.TimeStep:
+        """Begins the next episode."""
+        key = jax.random.fold_in(jax.random.key(self._seed), self._count)
+        self._count += 1
+        episode = self._reset(key)
+        return dm_env.restart(self._enter(episode, 0, episode.start)[0])
+
+    def step(self, action: Any) -> dm_env.TimeStep:
+        """One control step; begins an episode if none is under way.
+
+        Raises:
+            UsageError: the action has another shape than the scene's controls.
+            NonFiniteError: it is not finite.
+        """
+        if self._now is None or self._now[1] == self._scene.steps:
+            return self.reset()
+        episode, time, state = self._now
+        control = np.asarray(action, np.float32)
+        if control.shape != self.action_spec().shape:
+            raise UsageError(f"an action of shape {control.shape}; scene {self._scene.name} takes {self.action_spec().shape}")
+        if not np.all(np.isfinite(control)):
+            raise NonFiniteError(f"the action {control.tolist()} is not finite")
+        observation, reward = self._enter(episode, time + 1, self._advance(episode, time, state, jnp.asarray(control)))
+        ending = dm_env.truncation if time + 1 == self._scene.steps else dm_env.transition
+        return ending(reward=reward, observation=observation)
+
+    def observation_spec(self) -> specs.Array:
+        """The scene's observation, unbounded."""
+        return specs.Array(self._shape, np.float32, name="observation")
+
+    def action_spec(self) -> specs.BoundedArray:
+        """The scene's controls with their range."""
+        (low, high), names = self._scene.control_range.astype(np.float32).T, self._scene.world.control_names
+        return specs.BoundedArray(low.shape, np.float32, low, high, name=" ".join(names))
+
+    @functools.cached_property
+    def _shape(self) -> tuple[int, ...]:
+        episode = jax.eval_shape(self._scene.reset, jax.random.key(0))
+        return jax.eval_shape(self._scene.observe, episode, jnp.array(0), episode.start).shape
+
+    def _enter(self, episode: Episode, time: int, state: PhysicsState) -> tuple[np.ndarray, float]:
+        """Makes a state the current one, dm_control's physics included; returns its observation and reward."""
+        self._now = (episode, time, state)
+        x, y, heading = np.asarray(episode.surroundings.pose[time]).T
+        data = self._physics.data
+        with self._physics.reset_context():
+            data.qpos[:], data.qvel[:] = np.asarray(state.qpos), np.asarray(state.qvel)
+            data.mocap_pos[:, 0], data.mocap_pos[:, 1] = x, y
+            data.mocap_quat[:] = np.stack([np.cos(heading / 2), 0 * x, 0 * x, np.sin(heading / 2)], axis=1)
+            data.time = time * self.control_timestep()
+        observation, reward = self._look(episode, time, state)
+        return np.asarray(observation, np.float32), float(reward)

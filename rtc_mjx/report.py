@@ -1,0 +1,148 @@
+"""Tables and figures of runs side by side: learning curves (mean and standard deviation over seeds) and the last evaluation.
+
+`python -m rtc_mjx.report RUN... --out DIR` writes curves.png, table.md and results in one JSON file a method: evaluation.json with the
+settings, the versions and the commit that made it.
+"""
+
+import argparse
+import json
+import subprocess
+from collections.abc import Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.markdown import Markdown
+
+from rtc_mjx import __version__, cli
+from rtc_mjx import config as settings
+from rtc_mjx.errors import UsageError
+from rtc_mjx.runs import Run
+
+PACKAGES = ("mujoco", "mujoco-mjx", "jax", "flax", "optax")
+LOSSES = ("reconstruction", "cloning", "adversarial", "type_kl", "accuracy_expert", "accuracy_policy")
+
+
+def evaluation(run: Run) -> dict[str, Any]:
+    """The run's evaluation.json.
+
+    Raises:
+        UsageError: it has not been evaluated.
+    """
+    file = run.folder / "evaluation.json"
+    if not file.is_file():
+        raise UsageError(f"{run.folder} has no evaluation.json; make it with: python -m rtc_mjx.evaluate --run {run.folder}")
+    try:
+        return json.loads(file.read_text())
+    except ValueError as error:
+        raise UsageError(f"{file} is damaged: {error}") from error
+
+
+def table(runs: Sequence[Run]) -> str:
+    """A Markdown table: a row a method, under prior types; paired and shuffled where there are such; the expert below."""
+    results = [evaluation(run) for run in runs]
+    names = list(results[0]["metrics"])
+    rows = [["method", "types", *names], ["---", "---", *["---:"] * len(names)]]
+    for result in results:
+        for source, summary in result["types"].items():
+            rows.append([result["method"], source, *(_cell(summary[name]) for name in names)])
+    for who, values in results[0]["reference"].items():
+        rows.append([who.replace("_", " "), "", *(f"{values[name]:.4g}" for name in names)])
+    first = results[0]
+    caption = (
+        f"Scene {first['scene']}; {_range(r['seeds'] for r in results)} seeds, {_range(r['update'] for r in results)} updates, "
+        f"{_range(r['episodes'] for r in results)} test episodes. "
+        "Mean ± standard deviation over seeds [95 % bootstrap interval over episodes]."
+    )
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows) + f"\n\n{caption}\n"
+
+
+def _cell(summary: dict[str, Any]) -> str:
+    low, high = summary["interval"]
+    return f"{summary['mean']:.4g} ± {summary['std']:.2g} [{low:.4g}, {high:.4g}]"
+
+
+def _range(values: Any) -> str:
+    ordered = sorted(set(values))
+    return str(ordered[0]) if len(ordered) == 1 else f"{ordered[0]} to {ordered[-1]}"
+
+
+def curves(runs: Sequence[Run], file: Path) -> None:
+    """Main metrics and losses against updates, one line a method."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    main = runs[0].config.scene.main_metrics
+    panels = [*main, *(n for n in LOSSES if any(n in line for run in runs for line in run.metrics()[:1]))]
+    columns = min(4, len(panels))
+    canvas, axes = pyplot.subplots(
+        -(-len(panels) // columns), columns, figsize=(3.4 * columns, 2.6 * -(-len(panels) // columns)), squeeze=False
+    )
+    for axis, name in zip(axes.flat, panels, strict=False):
+        for index, run in enumerate(runs):
+            lines = [line for line in run.metrics() if name in line]
+            if not lines:
+                continue
+            updates, values = [line["update"] for line in lines], np.array([line[name] for line in lines])
+            mean, spread = values.mean(axis=1), values.std(axis=1)
+            axis.plot(updates, mean, color=f"C{index}", label=run.config.method, lw=1.4)
+            axis.fill_between(updates, mean - spread, mean + spread, color=f"C{index}", alpha=0.15, lw=0)
+        if name.startswith("jsd"):
+            axis.set_yscale("log")
+        axis.set_title(name.replace("_", " "), fontsize=10)
+        axis.grid(alpha=0.25)
+    for axis in axes.flat[len(panels) :]:
+        axis.axis("off")
+    axes[0][0].legend(frameon=False, fontsize=7)
+    for axis in axes[-1]:
+        axis.set_xlabel("updates")
+    canvas.tight_layout()
+    canvas.savefig(file, dpi=150)
+    pyplot.close(canvas)
+
+
+def record(run: Run) -> dict[str, Any]:
+    """The evaluation with all that is needed to make it again."""
+    versions = {"python_package": __version__, **{name: metadata.version(name) for name in PACKAGES}}
+    return {**evaluation(run), "config": settings.to_dict(run.config), "versions": versions, "commit": _commit()}
+
+
+def _commit() -> str | None:
+    """The commit of the checkout that this code runs from; None where there is none."""
+    try:
+        done = subprocess.run(
+            ["git", "describe", "--always", "--dirty"], cwd=Path(__file__).parent, capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return done.stdout.strip()
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Reports on runs."""
+    parser = cli.Parser(prog="python -m rtc_mjx.report", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run directories of one scene, evaluated")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="where the table, the figure and the results go; made if absent"
+    )
+    options = parser.parse_args(argv)
+    runs = [Run.open(folder) for folder in options.runs]
+    scenes = {run.config.scene.name for run in runs}
+    if len(scenes) > 1:
+        raise UsageError(f"runs of one scene are needed, these are of {', '.join(sorted(scenes))}")
+    records = [record(run) for run in runs]
+    options.out.mkdir(parents=True, exist_ok=True)
+    text = table(runs)
+    (options.out / "table.md").write_text(text)
+    curves(runs, options.out / "curves.png")
+    for held in records:
+        (options.out / f"{held['method']}.json").write_text(json.dumps(held, indent=1) + "\n")
+    Console().print(Markdown(text))
+
+
+if __name__ == "__main__":
+    cli.run(main)

@@ -1,0 +1,196 @@
+"""Laws that every scene obeys, and those of the double goal problem. A new scene is tested by standing in SCENES."""
+
+import functools
+
+import dm_env
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from absl.testing import absltest
+from dm_env import test_utils
+from jax import random
+
+from rtc_mjx import dataset
+from rtc_mjx.environment import Environment
+from rtc_mjx.errors import NonFiniteError, UsageError
+from rtc_mjx.rollout import rollout
+from rtc_mjx.scenes import SCENES, Actor, DoubleGoal, double_goal, scene_type
+
+
+@functools.cache
+def made(name):
+    return SCENES[name]()
+
+
+@functools.cache
+def experts(name, count=512):
+    scene = made(name)
+    return jax.device_get(jax.jit(jax.vmap(lambda k: dataset.demonstrate(scene, k)))(random.split(random.key(5), count)))
+
+
+@pytest.fixture(params=SCENES)
+def scene(request):
+    return made(request.param)
+
+
+def playback(scene, actions):
+    return Actor((), lambda memory, observation, action: (memory, action), actions)
+
+
+def test_trajectories_have_one_state_more_than_actions(scene):
+    track = experts(scene.name).trajectory
+    assert track.actions.shape[1:] == (scene.steps, len(scene.world.control_ids))
+    assert track.observations.shape[1] == track.states.qpos.shape[1] == scene.steps + 1
+
+
+def test_an_episode_starts_where_reset_says(scene):
+    held = experts(scene.name)
+    assert np.array_equal(held.trajectory.states.qpos[:, 0], held.episode.start.qpos)
+    assert all(x.shape[1] == scene.steps + 1 for x in jax.tree.leaves(held.episode.surroundings))
+
+
+def test_experts_are_finite_and_differ(scene):
+    track = experts(scene.name).trajectory
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(track))
+    assert np.all(np.std(track.actions, axis=0) > 0)
+
+
+def test_a_rollout_is_a_function_of_its_inputs(scene):
+    """Playing an expert's actions back gives the expert's states, and c MuJoCo agrees with them."""
+    held = jax.tree.map(lambda x: x[0], experts(scene.name))
+    again = rollout(scene, playback(scene, held.trajectory.actions), held.episode)
+    assert np.allclose(again.states.qpos, held.trajectory.states.qpos, atol=1e-5)
+
+
+def test_rollout_matches_c_mujoco(scene, x64):
+    held = jax.tree.map(lambda x: np.asarray(x[1], np.float64), experts(scene.name))
+    track = rollout(scene, playback(scene, held.trajectory.actions), held.episode)
+    data = mujoco.MjData(scene.world.mj)
+    data.qpos[:], data.qvel[:] = held.episode.start.qpos, held.episode.start.qvel
+    for time, action in enumerate(held.trajectory.actions):
+        x, y, heading = held.episode.surroundings.pose[time].T
+        data.mocap_pos[:, 0], data.mocap_pos[:, 1] = x, y
+        data.mocap_quat[:] = np.stack([np.cos(heading / 2), 0 * x, 0 * x, np.sin(heading / 2)], axis=1)
+        data.ctrl[list(scene.world.control_ids)] = action
+        for _ in range(scene.substeps):
+            mujoco.mj_step(scene.world.mj, data)
+        assert np.allclose(track.states.qpos[time + 1], data.qpos, atol=1e-6), time
+
+
+def test_features_and_metrics_are_finite_and_the_expert_equals_itself(scene):
+    held = experts(scene.name)
+    features = jax.device_get(jax.vmap(scene.features)(held.episode, held.trajectory))
+    result = scene.metrics(features, features)
+    assert all(np.isfinite(v) for v in result.values()) and set(scene.main_metrics) <= set(result)
+    assert all(v == 0 for name, v in result.items() if "jsd" in name)
+
+
+def test_demonstrations_come_from_the_cache_unchanged(scene, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    first = dataset.demonstrations(scene, 8, 3)
+    (file,) = tmp_path.rglob("*.npz")
+    stamp = file.stat().st_mtime_ns
+    second = dataset.demonstrations(scene, 8, 3)
+    assert file.stat().st_mtime_ns == stamp
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True))
+    file.write_bytes(file.read_bytes()[:200])  # cut short by a crash of the machine
+    third = dataset.demonstrations(scene, 8, 3)
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(third), strict=True))
+
+
+def test_cached_demonstrations_depend_on_every_setting(scene):
+    prints = {dataset.fingerprint(s, n, k) for s in (scene, type(scene)(steps=scene.steps + 1)) for n in (8, 9) for k in (0, 1)}
+    assert len(prints) == 8
+
+
+def test_unknown_scene_is_refused():
+    with pytest.raises(UsageError, match=r"nowhere.*double_goal"):
+        scene_type("nowhere")
+
+
+class TestConformance(test_utils.EnvironmentTestMixin, absltest.TestCase):
+    """dm_env's own conformance suite."""
+
+    def make_object_under_test(self):
+        return Environment(made("double_goal"))
+
+
+def test_environment_lives_whole_episodes_and_keeps_dm_controls_physics_in_step(scene):
+    environment = Environment(scene, seed=2)
+    action = np.full(environment.action_spec().shape, 0.1)
+    for _ in range(2):
+        steps = [environment.reset()]
+        while not steps[-1].last():
+            steps.append(environment.step(action))
+        assert len(steps) == scene.steps + 1 and steps[-1].discount == 1.0
+        assert all(s.observation.shape == environment.observation_spec().shape for s in steps)
+    body = environment.physics.named.data.xpos[scene.agent_body]
+    assert np.allclose(body[:2], steps[-1].observation[:2], atol=1e-5)
+    assert environment.physics.data.time == pytest.approx(scene.steps * environment.control_timestep())
+
+
+def test_environment_refuses_wrong_actions(scene):
+    environment = Environment(scene)
+    environment.reset()
+    with pytest.raises(UsageError, match="shape"):
+        environment.step(np.zeros(99))
+    with pytest.raises(NonFiniteError, match="nan"):
+        environment.step(np.full(environment.action_spec().shape, np.nan))
+
+
+def test_environment_starts_an_episode_when_stepped_before_reset(scene):
+    environment = Environment(scene)
+    assert environment.step(np.zeros(environment.action_spec().shape)).step_type == dm_env.StepType.FIRST
+
+
+# The double goal problem
+
+
+def test_goals_keep_their_sides():
+    y = experts("double_goal").episode.surroundings.pose[..., 1]
+    assert np.all(y[..., 0] < 0) and np.all(y[..., 1] > 0)
+
+
+def test_goals_drift_slowly_in_all_directions():
+    pose = experts("double_goal").episode.surroundings.pose[..., :2]
+    speed = np.linalg.norm(np.diff(pose, axis=1), axis=-1) / 0.05
+    assert np.percentile(speed, 99) < 1.05 * double_goal.DRIFT[1] and np.percentile(speed, 1) > 0.9 * double_goal.DRIFT[0]
+    way = np.sign(pose[:, -1] - pose[:, 0])
+    assert all(abs(np.mean(way[..., axis])) < 0.2 for axis in (0, 1))
+
+
+def test_expert_prefers_the_lower_goal_three_to_one():
+    held = experts("double_goal")
+    assert abs(np.mean(held.truth["goal"] == double_goal.LOWER) - 0.75) < 0.06
+    ended_upper = held.trajectory.states.qpos[:, -1, 1] > 0
+    assert np.mean(ended_upper == (held.truth["goal"] == double_goal.UPPER)) > 0.99
+
+
+def test_neither_side_gives_the_goal_away_early():
+    held = experts("double_goal")
+    lower, below = held.truth["goal"] == double_goal.LOWER, held.trajectory.states.qpos[:, 15, 1] < 0
+    assert 0.5 < np.mean(lower[below]) < 0.9 and 0.5 < np.mean(lower[~below]) < 0.9
+
+
+def test_both_goals_are_equally_easy():
+    """Experts sent to one or the other from the first step stay there equally long."""
+    returns = []
+    for probability in (1.0, 0.0):
+        scene = DoubleGoal(lower_probability=probability)
+        held = jax.jit(jax.vmap(lambda k, scene=scene: dataset.demonstrate(scene, k)))(random.split(random.key(6), 512))
+        returns.append(np.asarray(jax.vmap(scene.features)(held.episode, held.trajectory)["return"]))
+    assert abs(returns[0].mean() - returns[1].mean()) < 3 * np.hypot(*(r.std() / np.sqrt(len(r)) for r in returns))
+
+
+def test_return_counts_steps_at_a_goal():
+    """By hand: placed on a goal for three of four steps, a little more than 0.1 m off in the last."""
+    scene = DoubleGoal(steps=4)
+    episode = scene.reset(random.key(0))
+    goal = episode.surroundings.pose[:, 1, :2]
+    states = jax.tree.map(lambda x: jnp.broadcast_to(x, (5, *x.shape)), episode.start)
+    at_goal = type(states)(goal.at[4, 0].add(0.101), states.qvel, states.warmstart)
+    track = rollout(scene, playback(scene, jnp.zeros((4, 2))), episode)
+    features = scene.features(episode, type(track)(at_goal, track.observations, track.actions))
+    assert features["return"] == 3 and features["upper"] == 1
