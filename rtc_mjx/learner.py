@@ -151,40 +151,48 @@ def transformation(learner: Learner) -> optax.GradientTransformation:
 
 def train_step(learner: Learner, state: TrainState, expert: Demonstration) -> tuple[TrainState, dict[str, Array]]:
     """One update of one seed; `expert` holds all demonstrations. Returns the next state and what to log."""
-    draw, types, play, extra = random.split(random.fold_in(random.key(state.seed), state.update), 4)
+    draw, key = random.split(random.fold_in(random.key(state.seed), state.update))
     rows = random.randint(draw, (learner.batch,), 0, jax.tree.leaves(expert)[0].shape[0])
     batch = jax.tree.map(lambda x: x[rows], expert)
-    held = learner.agent(lax.stop_gradient(state.networks))
+    gradient, report = gradients(learner, state.networks, batch, key, state.update)
+    step, optimiser = transformation(learner).update(gradient, state.optimiser, state.networks)
+    report |= {"gradient_norm": optax.tree.norm(gradient.policy)}
+    return TrainState(optax.apply_updates(state.networks, step), optimiser, state.seed, state.update + 1), report
+
+
+def gradients(
+    learner: Learner, networks: Networks, batch: Demonstration, key: Array, update: Array
+) -> tuple[Networks, dict[str, Array]]:
+    """The gradient of all losses on a minibatch, in the two stages that the module's docstring tells; and what to log."""
+    types, play, extra = random.split(key, 3)
+    held = learner.agent(lax.stop_gradient(networks))
     tracks, alive, pull = play_together(learner, held, batch, infer(learner, held, batch, types), play)
 
     def total(networks: Networks, tracks: Trajectory | None) -> tuple[Array, dict[str, Array]]:
         agent = learner.agent(networks)
         lost = branch_losses(learner, agent, batch, infer(learner, agent, batch, types), tracks, alive, extra)
         critic, seen = critic_loss(learner, agent, batch, tracks, alive)
-        return learner.weights.total(lost, state.update) + critic, lost | seen
+        return learner.weights.total(lost, update) + critic, lost | seen
 
-    (gradient, through), report = jax.grad(total, argnums=(0, 1), has_aux=True)(state.networks, tracks)
-    if tracks is not None:
-        cotangents, guarded = guard(pull(through), alive, learner.optimiser.trajectory_clip)
+    (gradient, through), report = jax.grad(total, argnums=(0, 1), has_aux=True)(networks, tracks)
+    if tracks is None:
+        return gradient, report
+    cotangents, guarded = guard(pull(through), alive, learner.optimiser.trajectory_clip)
 
-        def along(networks: Networks) -> Array:
-            agent = learner.agent(networks)
-            g = joined_types(learner, infer(learner, agent, batch, types))
-            return jnp.sum(cotangents * jax.vmap(agent.policy_outputs)(tracks.observations[:, :-1], g))
+    def along(networks: Networks) -> Array:
+        agent = learner.agent(networks)
+        g = joined_types(learner, infer(learner, agent, batch, types))
+        return jnp.sum(cotangents * jax.vmap(agent.policy_outputs)(tracks.observations[:, :-1], g))
 
-        gradient = jax.tree.map(jnp.add, gradient, jax.grad(along)(state.networks))
-        report |= guarded
-    step, optimiser = transformation(learner).update(gradient, state.optimiser, state.networks)
-    report |= {"gradient_norm": optax.tree.norm(gradient.policy)}
-    return TrainState(optax.apply_updates(state.networks, step), optimiser, state.seed, state.update + 1), report
+    return jax.tree.map(jnp.add, gradient, jax.grad(along)(networks)), report | guarded
 
 
 def infer(learner: Learner, agent: Agent, batch: Demonstration, key: Array) -> list[Typed]:
     """Types of each branch, for its rows of the minibatch."""
     typed = []
-    for branch, branch_key in zip(learner.method.branches, random.split(key, len(learner.method.branches)), strict=True):
+    for index, branch in enumerate(learner.method.branches):
         mine = learner.part(branch, batch)
-        keys = random.split(branch_key, len(jax.tree.leaves(mine)[0]))
+        keys = random.split(random.fold_in(key, index), len(jax.tree.leaves(mine)[0]))
         typed.append(jax.vmap(functools.partial(SOURCES[branch.types], agent))(mine, keys))
     return typed
 
