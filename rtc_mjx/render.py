@@ -128,15 +128,14 @@ def _place(
     mujoco.mj_forward(model, data)
 
 
-def write(frames: Iterator[Picture], file: Path, rate: float, total: int) -> int:
-    """Encodes pictures as H.264 in an mp4; returns how many."""
+def write(frames: Iterator[Picture], file: Path, size: tuple[int, int], rate: float, total: int) -> int:
+    """Encodes pictures of a size (height, width) as H.264 in an mp4; returns how many."""
     part, count = file.with_name(f".{file.name}.part"), 0
     with av.open(str(part), "w", format="mp4") as out, Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("frames", total=total)
         stream = out.add_stream("libx264", rate=Fraction(rate).limit_denominator(1000))
-        stream.pix_fmt = "yuv420p"
+        stream.pix_fmt, (stream.height, stream.width) = "yuv420p", size
         for picture in frames:
-            stream.height, stream.width = picture.shape[:2]
             out.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
             count += 1
             progress.advance(task)
@@ -171,7 +170,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     shown, tracks = rollouts(run, options.episodes, options.types, options.seed)
     rate = 1 / (run.config.scene.substeps * run.config.scene.world.timestep)
     total = len(tracks.actions) * (run.config.scene.steps + HOLD)
-    count = write(pictures(run, shown, tracks, options.camera, size), out, rate, total)
+    count = write(pictures(run, shown, tracks, options.camera, size), out, size, rate, total)
     Console().print(f"{out}: {count} frames of {len(tracks.actions)} episodes")
 
 

@@ -20,14 +20,15 @@ from rtc_mjx.physics import PhysicsState, Surroundings, World, load, rest_state
 from rtc_mjx.scenes.base import Actor, Scene
 from rtc_mjx.trajectory import Episode, Trajectory
 
-GOAL_X = (0.6, 1.1)  # m, goals are drawn in this range ...
-GOAL_Y = (0.4, 0.8)  # m, ... on either side of y = 0
+GOAL_X = (-0.9, 0.9)  # m, goals are drawn in this range ...
+GOAL_Y = (0.35, 0.9)  # m, ... on either side of y = 0
 NEAREST_Y = 0.25  # m, a drifting goal turns back here, so it keeps its side
-DRIFT = (0.02, 0.10)  # m/s
+DRIFT = (0.05, 0.2)  # m/s
 REACHED = 0.1  # m, from an agent to a goal it has reached
-SPEED = 2.0  # m/s, the expert's on its way
+SPEED = 2.2  # m/s, the expert's on its way ...
+CIRCLING = 1.0  # m/s, ... and while it is undecided: it then moves at right angles to the goal in mind, and nears neither
 SLOW_WITHIN = 0.25  # m, from its goal, where the expert begins to slow down
-BEND = (0.7, 1.1)  # rad, how far off the straight line it heads at first, to either side
+BEND = (0.7, 1.0)  # rad, how far off the straight line it heads at first, to either side
 BEND_WITHIN = 0.9  # m, from its goal, where it begins to turn in
 GAIN = 1.2  # control per m/s of velocity error
 TREMOR = 0.1  # standard deviation of the expert's controls
@@ -69,8 +70,8 @@ class DoubleGoal(Scene):
         return Episode(rest_state(self.world), Surroundings(pose, jnp.full((self.steps + 1, 2, 2), 2 * REACHED)), ())
 
     def observe(self, episode: Episode, time: Array, state: PhysicsState) -> Float[Array, "9"]:
-        """Position in m, velocity in m/s, both goals from the agent in m, and the time as a share of the episode."""
-        goals = episode.surroundings.pose[time, :, :2] - state.qpos
+        """Position in m, velocity in m/s, where both goals are in m, and the time as a share of the episode."""
+        goals = episode.surroundings.pose[time, :, :2]
         return jnp.concatenate([state.qpos, state.qvel, goals[LOWER], goals[UPPER], jnp.array([time / self.steps])])
 
     def reward(self, episode: Episode, time: Array, state: PhysicsState) -> Float[Array, ""]:
@@ -84,11 +85,14 @@ class DoubleGoal(Scene):
         draws = random.bernoulli(goals, 1 - self.lower_probability, (self.steps,)).astype(int)
         goal = draws[jnp.minimum(jnp.arange(self.steps), UNDECIDED - 1)]
         bend = random.rademacher(side, ()) * random.uniform(size, minval=BEND[0], maxval=BEND[1])
-        noise = {"goal": goal, "tremor": TREMOR * random.normal(tremor, (self.steps, 2))}
+        noise = {"goal": goal, "undecided": jnp.arange(self.steps) < UNDECIDED, "tremor": TREMOR * random.normal(tremor, (self.steps, 2))}
 
         def act(memory: tuple[()], observation: Array, noise: dict[str, Array]) -> tuple[tuple[()], Array]:
-            away = observation[4:8].reshape(2, 2)[noise["goal"]]
-            return memory, _towards(away, observation[2:4], bend) + noise["tremor"]
+            away = observation[4:8].reshape(2, 2)[noise["goal"]] - observation[:2]
+            bent = bend * jnp.clip(jnp.sqrt(jnp.sum(away**2) + 1e-12) / BEND_WITHIN, 0, 1)
+            angle = jnp.where(noise["undecided"], jnp.sign(bend) * jnp.pi / 2, bent)
+            speed = jnp.where(noise["undecided"], CIRCLING, SPEED)
+            return memory, _towards(away, observation[2:4], angle, speed) + noise["tremor"]
 
         return Actor((), act, noise), {"goal": goal[-1], "bend": bend}
 
@@ -109,10 +113,9 @@ class DoubleGoal(Scene):
         }
 
 
-def _towards(away: Float[Array, "2"], velocity: Float[Array, "2"], bend: Array) -> Float[Array, "2"]:
-    """The control that follows a bent path to a goal `away` from the agent."""
+def _towards(away: Float[Array, "2"], velocity: Float[Array, "2"], angle: Array, speed: Array) -> Float[Array, "2"]:
+    """The control that heads `angle` off the straight line to a goal `away` from the agent, slowing down near it."""
     distance = jnp.sqrt(jnp.sum(away**2) + 1e-12)
-    angle = bend * jnp.clip(distance / BEND_WITHIN, 0, 1)
     turn = jnp.array([[jnp.cos(angle), -jnp.sin(angle)], [jnp.sin(angle), jnp.cos(angle)]])
-    wanted = SPEED * jnp.clip(distance / SLOW_WITHIN, 0, 1) * turn @ (away / distance)
+    wanted = speed * jnp.clip(distance / SLOW_WITHIN, 0, 1) * turn @ (away / distance)
     return jnp.clip(GAIN * (wanted - velocity) + velocity / 3, -1, 1)  # 1/3: damping over actuator gain
