@@ -41,6 +41,7 @@ class OptimiserOptions:
         learning_rate: Adam's, of policy and encoder; falls along a half cosine to `final_rate` of it.
         prior_rate: Adam's, of the prior; falls alike.
         discriminator_rate: Adam's, of discriminator and Q; constant.
+        discriminator_steps: of each trajectory, at random times, that the discriminator learns from in an update; 0 for all.
         final_rate: share of the learning rate left at the last update.
         clip: largest norm of an update's gradient, policy and discriminator apart.
         trajectory_clip: largest norm of one trajectory's gradient by the policy's outputs, in units of the minibatch's mean loss.
@@ -51,6 +52,7 @@ class OptimiserOptions:
     learning_rate: float = 1e-3
     prior_rate: float = 3e-3
     discriminator_rate: float = 1e-3
+    discriminator_steps: int = 0
     final_rate: float = 0.1
     clip: float = 1.0
     trajectory_clip: float = 10.0
@@ -160,31 +162,33 @@ def train_step(learner: Learner, state: TrainState, expert: Demonstration) -> tu
     return TrainState(optax.apply_updates(state.networks, step), optimiser, state.seed, state.update + 1), report
 
 
-def gradients(
-    learner: Learner, networks: Networks, batch: Demonstration, key: Array, update: Array
-) -> tuple[Networks, dict[str, Array]]:
+def gradients(learner: Learner, networks: Networks, batch: Demonstration, key: Array, update: Array) -> tuple[Networks, dict[str, Array]]:
     """The gradient of all losses on a minibatch, in the two stages that the module's docstring tells; and what to log."""
-    types, play, extra = random.split(key, 3)
+    types, play, extra, glance = random.split(key, 4)
     held = learner.agent(lax.stop_gradient(networks))
-    tracks, alive, pull = play_together(learner, held, batch, infer(learner, held, batch, types), play)
+    now = infer(learner, held, batch, types)
+    played, pull = play_together(learner, held, batch, now, play)
 
-    def total(networks: Networks, tracks: Trajectory | None) -> tuple[Array, dict[str, Array]]:
+    def by_rollouts(tracks: Trajectory) -> Array:
+        lost = branch_losses(learner, held, batch, now, Played(tracks, played.alive), extra, CLOSED_LOOP)
+        return learner.weights.total(lost, update)
+
+    cotangents, guarded = jnp.zeros(()), {}
+    if played is not None:
+        cotangents, guarded = guard(pull(jax.grad(by_rollouts)(played.tracks)), played.alive, learner.optimiser.trajectory_clip)
+
+    def total(networks: Networks) -> tuple[Array, dict[str, Array]]:
         agent = learner.agent(networks)
-        lost = branch_losses(learner, agent, batch, infer(learner, agent, batch, types), tracks, alive, extra)
-        critic, seen = critic_loss(learner, agent, batch, tracks, alive)
-        return learner.weights.total(lost, update) + critic, lost | seen
+        typed = infer(learner, agent, batch, types)
+        lost = branch_losses(learner, agent, batch, typed, played, extra, frozenset(LOSSES))
+        if played is None:
+            return learner.weights.total(lost, update), lost
+        critic, seen = critic_loss(learner, agent, batch, played, glance)
+        outputs = jax.vmap(agent.policy_outputs)(played.tracks.observations[:, :-1], joined_types(learner, typed))
+        return learner.weights.total(lost, update) + critic + jnp.sum(cotangents * outputs), lost | seen
 
-    (gradient, through), report = jax.grad(total, argnums=(0, 1), has_aux=True)(networks, tracks)
-    if tracks is None:
-        return gradient, report
-    cotangents, guarded = guard(pull(through), alive, learner.optimiser.trajectory_clip)
-
-    def along(networks: Networks) -> Array:
-        agent = learner.agent(networks)
-        g = joined_types(learner, infer(learner, agent, batch, types))
-        return jnp.sum(cotangents * jax.vmap(agent.policy_outputs)(tracks.observations[:, :-1], g))
-
-    return jax.tree.map(jnp.add, gradient, jax.grad(along)(networks)), report | guarded
+    gradient, report = jax.grad(total, has_aux=True)(networks)
+    return gradient, report | guarded
 
 
 def infer(learner: Learner, agent: Agent, batch: Demonstration, key: Array) -> list[Typed]:
@@ -202,21 +206,31 @@ def joined_types(learner: Learner, typed: list[Typed]) -> Float[Array, "rows siz
     return jnp.concatenate([t.agent_type for b, t in zip(learner.method.branches, typed, strict=True) if b.closed_loop])
 
 
+@pytree
+class Played:
+    """Rollouts of several episodes.
+
+    Attributes:
+        tracks: trajectories, those that are not finite set to zero.
+        alive: which are finite.
+    """
+
+    tracks: Any
+    alive: Array
+
+
 Pull = Callable[[Trajectory], Float[Array, "rows steps outputs"]]
 
 
-def play_together(
-    learner: Learner, agent: Agent, batch: Demonstration, typed: list[Typed], key: Array
-) -> tuple[Trajectory | None, Array, Pull]:
-    """The rollouts of all closed-loop branches, in one simulation.
+def play_together(learner: Learner, agent: Agent, batch: Demonstration, typed: list[Typed], key: Array) -> tuple[Played | None, Pull]:
+    """The rollouts of all closed-loop branches, in one simulation; None where there is no such branch.
 
     Returns:
-        Trajectories, those that are not finite set to zero; which are finite; and the function from the gradient by them
-        to that by the policy's outputs at each step. Without a closed-loop branch there are no trajectories.
+        The rollouts, and the function from a gradient by them to that by the policy's outputs at each step.
     """
     rows = [np.arange(learner.batch)[learner.rows(b)] for b in learner.method.branches if b.closed_loop]
     if not rows:
-        return None, jnp.ones(0, bool), lambda tracks: tracks.actions
+        return None, lambda tracks: tracks.actions
     episodes = jax.tree.map(lambda x: x[np.concatenate(rows)], batch.episode)
     g = joined_types(learner, typed)
     keys = random.split(key, len(g))
@@ -227,44 +241,42 @@ def play_together(
     tracks, back = jax.vjp(play, jnp.zeros((len(g), learner.scene.steps, agent.outputs)))
     finite = [jnp.all(jnp.isfinite(x), axis=tuple(range(1, x.ndim))) for x in jax.tree.leaves(tracks)]
     alive = functools.reduce(jnp.logical_and, finite)
-    return _only(alive, tracks), alive, lambda gradient: back(gradient)[0]
+    return Played(_only(alive, tracks), alive), lambda gradient: back(gradient)[0]
 
 
 def branch_losses(
-    learner: Learner, agent: Agent, batch: Demonstration, typed: list[Typed], tracks: Trajectory | None, alive: Array, key: Array
+    learner: Learner, agent: Agent, batch: Demonstration, typed: list[Typed], played: Played | None, key: Array, names: frozenset[str]
 ) -> dict[str, Array]:
-    """Each loss as the sum over branches of its mean over the branch's rows (its rollouts that are finite, if it reads them)."""
+    """Each loss of `names` as the sum over branches of its mean over the branch's rows (its rollouts that are finite, if it reads them)."""
     sums: dict[str, Array] = {}
     first = 0
     for branch, types in zip(learner.method.branches, typed, strict=True):
         mine = learner.part(branch, batch)
         count = len(types.agent_type)
-        played, counts = None, jnp.ones(count, bool)
+        part = Played(None, jnp.ones(count, bool))
         if branch.closed_loop:
-            played, counts = jax.tree.map(lambda x, a=first, n=count: x[a : a + n], (tracks, alive))
+            part = jax.tree.map(lambda x, a=first, n=count: x[a : a + n], played)
             first += count
-        cases = Case(mine, types, played, random.split(key, count))
-        for name in branch.losses:
+        cases = Case(mine, types, part.tracks, random.split(key, count))
+        for name in (n for n in branch.losses if n in names):
             each = jax.vmap(lambda case, loss=LOSSES[name]: loss(agent, case, learner.weights))(cases)
-            sums[name] = sums.get(name, 0.0) + _mean(each, counts if name in CLOSED_LOOP else jnp.ones(count, bool))
+            sums[name] = sums.get(name, 0.0) + _mean(each, part.alive if name in CLOSED_LOOP else jnp.ones(count, bool))
     return sums
 
 
-def critic_loss(
-    learner: Learner, agent: Agent, batch: Demonstration, tracks: Trajectory | None, alive: Array
-) -> tuple[Array, dict[str, Array]]:
-    """The discriminator's loss on the minibatch's demonstrations and on the rollouts of all branches, with its accuracies."""
-    if agent.networks.discriminator is None or tracks is None:
-        return jnp.zeros(()), {}
-    real, fake = (lax.stop_gradient((t.observations[:, :-1], t.actions)) for t in (batch.trajectory, tracks))
+def critic_loss(learner: Learner, agent: Agent, batch: Demonstration, played: Played, key: Array) -> tuple[Array, dict[str, Array]]:
+    """The discriminator's loss on demonstrations and on the rollouts of all branches, at random times; and its accuracies."""
+    steps = learner.scene.steps
+    times = random.permutation(key, steps)[: learner.optimiser.discriminator_steps or steps]
+    real, fake = (lax.stop_gradient((t.observations[:, times], t.actions[:, times])) for t in (batch.trajectory, played.tracks))
     real_logit, fake_logit = jax.vmap(agent.logit)(*real), jax.vmap(agent.logit)(*fake)
-    entropy = jnp.mean(jax.nn.softplus(-real_logit)) + _mean(jnp.mean(jax.nn.softplus(fake_logit), axis=1), alive)
+    entropy = jnp.mean(jax.nn.softplus(-real_logit)) + _mean(jnp.mean(jax.nn.softplus(fake_logit), axis=1), played.alive)
     penalty = gradient_penalty(agent, *real)
     report = {
         "discriminator": entropy,
         "discriminator_penalty": penalty,
         "accuracy_expert": jnp.mean(real_logit > 0),
-        "accuracy_policy": _mean(jnp.mean(fake_logit < 0, axis=1), alive),
+        "accuracy_policy": _mean(jnp.mean(fake_logit < 0, axis=1), played.alive),
     }
     return entropy + learner.weights.discriminator_penalty * penalty, report
 

@@ -111,6 +111,7 @@ def test_pathwise_gradients_match_differences_of_the_expectation(name, x64):
 
 def test_straight_through_choice_has_the_sign_of_the_expectations_gradient(x64):
     """Biased, as its docstring says: the gradient by the weights has the right sign where the components lie on one line."""
+
     def mean_square(logits, noise, choice_gradient=True):
         held = GaussianMixture(logits, jnp.array([[1.0], [-1.0]]), jnp.full((2, 1), 0.1))
         return jnp.mean(jax.vmap(lambda n: (held.sample(n, choice_gradient)[0] - 1) ** 2)(noise))
@@ -123,7 +124,11 @@ def test_straight_through_choice_has_the_sign_of_the_expectations_gradient(x64):
 
 @pytest.mark.parametrize("space", [Continuous(3, 4), Discrete(5)])
 def test_type_spaces_make_finite_distributions_of_their_size(space):
-    for make, count in ((space.posterior, space.posterior_outputs), (space.inference, space.posterior_outputs), (space.prior, space.prior_outputs)):
+    for make, count in (
+        (space.posterior, space.posterior_outputs),
+        (space.inference, space.posterior_outputs),
+        (space.prior, space.prior_outputs),
+    ):
         for scale in (0.0, 30.0):
             held = make(scale * jnp.linspace(-1, 1, count))
             value = held.sample(held.noise(random.key(0)))
@@ -139,7 +144,9 @@ def test_default_kl_direction_learns_the_marginal_and_the_literal_one_does_not()
 
     def fitted(loss):
         logits = jnp.zeros(2)
-        step = jax.jit(lambda x: x - 2.0 * jax.grad(lambda y: sum(w * loss(e, OneHot(y)) for w, e in zip(weights, encoders, strict=True)))(x))
+        step = jax.jit(
+            lambda x: x - 2.0 * jax.grad(lambda y: sum(w * loss(e, OneHot(y)) for w, e in zip(weights, encoders, strict=True)))(x)
+        )
         for _ in range(2000):
             logits = step(logits)
         return float(OneHot(logits).probabilities[0])

@@ -8,11 +8,11 @@ import numpy as np
 import optax
 import pytest
 from jax import random
-
 from learning import CLOSED_LOOP, ON_SCENE, SCENE, begin, experts, learner
+
 from rtc_mjx import learner as learning
 from rtc_mjx.agent_types import SOURCES
-from rtc_mjx.learner import gradients, train_step
+from rtc_mjx.learner import Played, gradients, train_step
 from rtc_mjx.losses import LOSSES, Case, LossWeights
 from rtc_mjx.methods import METHODS
 from rtc_mjx.models import Networks
@@ -32,12 +32,12 @@ def size(tree):
 
 def plain_loss(held, networks, batch, key):
     """All losses with the networks inside the simulation loop: what the two stages must differentiate."""
-    types, play, extra = random.split(key, 3)
+    types, play, extra, glance = random.split(key, 4)
     agent = held.agent(networks)
     typed = learning.infer(held, agent, batch, types)
-    tracks, alive = plain_rollouts(held, agent, batch, typed, play)
-    lost = learning.branch_losses(held, agent, batch, typed, tracks, alive, extra)
-    critic, _ = learning.critic_loss(held, agent, batch, tracks, alive)
+    played = plain_rollouts(held, agent, batch, typed, play)
+    lost = learning.branch_losses(held, agent, batch, typed, played, extra, frozenset(LOSSES))
+    critic = learning.critic_loss(held, agent, batch, played, glance)[0] if played else 0.0
     return held.weights.total(lost, jnp.array(0)) + critic
 
 
@@ -45,11 +45,11 @@ def plain_rollouts(held, agent, batch, typed, key):
     """As `play_together` numbers and draws them."""
     rows = [np.arange(held.batch)[held.rows(b)] for b in held.method.branches if b.closed_loop]
     if not rows:
-        return None, jnp.ones(0, bool)
+        return None
     episodes, g = jax.tree.map(lambda x: x[np.concatenate(rows)], batch.episode), learning.joined_types(held, typed)
     nudge = jnp.zeros((SCENE.steps, agent.outputs))
     tracks = jax.vmap(lambda e, t, k: held.play(agent, e, t, k, nudge))(episodes, g, random.split(key, len(g)))
-    return tracks, jnp.ones(len(g), bool)
+    return Played(tracks, jnp.ones(len(g), bool))
 
 
 @pytest.mark.parametrize("method", ON_SCENE)
@@ -75,15 +75,18 @@ def test_gradient_through_rollouts_matches_differences(x64):
         up, down = (agent_side(jax.tree.unflatten(tree, [x + h * w for x, w in zip(leaves, way, strict=True)])) for h in (1e-6, -1e-6))
         slope = sum(float(jnp.sum(g * w)) for g, w in zip(jax.tree.leaves(ours.policy), way, strict=True))
         # the discriminator's own loss moves with the rollouts too, but is not the policy's to lower: take it off
-        critic = [_critic(held, state, batch, jax.tree.unflatten(tree, [x + h * w for x, w in zip(leaves, way, strict=True)])) for h in (1e-6, -1e-6)]
+        critic = [
+            _critic(held, state, batch, jax.tree.unflatten(tree, [x + h * w for x, w in zip(leaves, way, strict=True)]))
+            for h in (1e-6, -1e-6)
+        ]
         assert abs((float(up - down) - (critic[0] - critic[1])) / 2e-6 - slope) < 1e-5 * (1 + abs(slope))
 
 
 def _critic(held, state, batch, policy):
     agent = held.agent(dataclasses.replace(state.networks, policy=policy))
-    types, play, _ = random.split(random.key(3), 3)
-    tracks, alive, _ = learning.play_together(held, agent, batch, learning.infer(held, agent, batch, types), play)
-    return float(learning.critic_loss(held, agent, batch, tracks, alive)[0])
+    types, play, _, glance = random.split(random.key(3), 4)
+    played, _ = learning.play_together(held, agent, batch, learning.infer(held, agent, batch, types), play)
+    return float(learning.critic_loss(held, agent, batch, played, glance)[0])
 
 
 @pytest.mark.parametrize("method", ["rtc_c", "rtc_d"])
@@ -108,12 +111,12 @@ def test_discriminator_gets_no_gradient_from_what_the_policy_loses(method):
     held = learner(method)
     state, batch = begin(held)
     agent_types = learning.infer(held, held.agent(state.networks), batch, random.key(1))
-    tracks, alive, _ = learning.play_together(held, held.agent(state.networks), batch, agent_types, random.key(2))
+    played, _ = learning.play_together(held, held.agent(state.networks), batch, agent_types, random.key(2))
 
     def lost(networks):
         agent = held.agent(networks)
         typed = learning.infer(held, agent, batch, random.key(1))
-        return sum(learning.branch_losses(held, agent, batch, typed, tracks, alive, random.key(3)).values())
+        return sum(learning.branch_losses(held, agent, batch, typed, played, random.key(3), frozenset(LOSSES)).values())
 
     assert size(jax.grad(lost)(state.networks).discriminator) == 0
 
@@ -126,8 +129,8 @@ def test_a_step_down_the_adversarial_loss_raises_the_experts_probability(method,
 
     def probability(networks):
         agent = held.agent(dataclasses.replace(networks, discriminator=state.networks.discriminator))
-        types, play, _ = random.split(random.key(0), 3)
-        tracks, _, _ = learning.play_together(held, agent, batch, learning.infer(held, agent, batch, types), play)
+        types, play, _, _ = random.split(random.key(0), 4)
+        tracks = learning.play_together(held, agent, batch, learning.infer(held, agent, batch, types), play)[0].tracks
         return float(jnp.mean(jax.nn.sigmoid(jax.vmap(agent.logit)(tracks.observations[:, :-1], tracks.actions))))
 
     stepped = jax.tree.map(lambda x, g: x - 0.05 * g / (1e-9 + size(gradient.policy)), state.networks, gradient)
@@ -270,4 +273,6 @@ def test_cloning_loss_by_hand():
     lost = LOSSES["cloning"](agent, Case(one, typed, None, random.key(0)), held.weights)
     scale = held.model.smallest_scale + np.log(2)
     actions = np.asarray(one.trajectory.actions, float)
-    assert float(lost) == pytest.approx(np.mean(np.sum(0.5 * (actions / scale) ** 2 + np.log(scale) + 0.5 * np.log(2 * np.pi), axis=1)), rel=1e-5)
+    assert float(lost) == pytest.approx(
+        np.mean(np.sum(0.5 * (actions / scale) ** 2 + np.log(scale) + 0.5 * np.log(2 * np.pi), axis=1)), rel=1e-5
+    )

@@ -14,8 +14,8 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-
 from learning import ON_SCENE, SCENE, settings
+
 from rtc_mjx import config, evaluate, render, report, train
 from rtc_mjx.config import Config
 from rtc_mjx.errors import RunError, UsageError
@@ -23,10 +23,8 @@ from rtc_mjx.runs import Run
 from rtc_mjx.scenes import SCENES
 
 ROOT = Path(__file__).resolve().parents[1]
-SMALL = (
-    "--scene double_goal --scene.steps 16 --updates 40 --batch 16 --model.width 16 --model.type-size 3 --experts.train 256 "
-    "--experts.test 64 --every.log 10 --every.test 20 --every.save 20"
-).split()
+SMALL = ["--scene", "double_goal", "--scene.steps", "16", "--updates", "40", "--batch", "16", "--model.width", "16"]
+SMALL += ["--experts.train", "256", "--experts.test", "64", "--every.log", "10", "--every.test", "20", "--every.save", "20"]
 
 
 def lines(run):
@@ -367,7 +365,20 @@ def test_exit_statuses(tmp_path):
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     wrong = subprocess.run([sys.executable, "-m", "rtc_mjx.train", "--updates", "0"], env=env, capture_output=True, text=True, timeout=100)
     assert wrong.returncode == 2 and wrong.stderr.count("\n") == 1 and not wrong.stdout
-    right = [sys.executable, "-W", "error", "-m", "rtc_mjx.train", "--method", "bc", *SMALL, "--updates", "20", "--run", str(tmp_path / "r")]
+    right = [
+        sys.executable,
+        "-W",
+        "error",
+        "-m",
+        "rtc_mjx.train",
+        "--method",
+        "bc",
+        *SMALL,
+        "--updates",
+        "20",
+        "--run",
+        str(tmp_path / "r"),
+    ]
     done = subprocess.run(right, env=env, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert re.search(r"^update 20/20 .*return", done.stderr, re.M) and "\x1b" not in done.stderr + done.stdout
