@@ -1,11 +1,13 @@
-"""Physics, side by side in one process: MJX as it comes, ours plain, ours specialised, and hand-written equations.
+"""Physics, side by side in one process: MJX as it comes, ours plain, ours specialised, and hand-written equations; and whole updates.
 
 Variants are timed in turn, round by round, so that a slow moment of the machine meets all of them; medians are reported. A
 rollout starts from random states, with road users close enough that some worlds collide; the gradient is that of the last
-positions with respect to all controls.
+positions with respect to all controls. An update is one of training: sampling, rollouts, losses, gradients, optimiser.
 """
 
 import argparse
+import dataclasses
+import functools
 import json
 import os
 import subprocess
@@ -15,6 +17,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,8 +29,9 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from rtc_mjx import cache, cli, pile_up
+from rtc_mjx import cache, cli, config, dataset, evaluate, pile_up
 from rtc_mjx.errors import UsageError
+from rtc_mjx.learner import compiled_chunk, start
 from rtc_mjx.physics import PhysicsState, Surroundings, World, load, rest_state, rest_surroundings, simulate, specialised_step
 
 WORLDS: dict[str, Callable[[], World]] = {
@@ -38,6 +42,8 @@ WORLDS: dict[str, Callable[[], World]] = {
 VARIANTS = ("native", "plain", "specialised", "handwritten")
 DIRECTIONS = ("forward", "gradient")
 BATCHES = (16, 64, 256, 1024, 4096)
+PARTS = ("physics", "pile_up", "update")
+UPDATES = 10  # training updates of a timed sample
 STEPS = 32  # physics steps of a rollout
 SAMPLE_SECONDS = 0.05  # how long one timed sample lasts at least
 MEMORY_LIMIT_MB = 6000.0  # rows that would need more are left out, and say so
@@ -181,6 +187,47 @@ def _seconds(function: Callable[..., Array], inputs: Inputs, calls: int) -> floa
     return (time.perf_counter() - start) / calls
 
 
+def updates(method: str, rounds: int, seed_counts: Sequence[int] = (1, 8)) -> list[dict[str, object]]:
+    """Milliseconds an update of a method on the double goal takes, on MJX and on a hand-written point mass, for numbers of seeds."""
+    settings = config.defaults("double_goal", method)
+    expert = dataset.demonstrations(settings.scene, 1024, evaluate.TRAIN_DATA)
+    learner, data = evaluate.learner_for(settings, expert), evaluate.without_truth(expert)
+    timestep = settings.scene.world.timestep
+
+    def by_hand(state: PhysicsState, force: Array, around: Surroundings) -> PhysicsState:
+        velocity = (state.qvel + timestep * 6.0 * jnp.clip(force, -1, 1)) / (1 + 2.0 * timestep)
+        return PhysicsState(state.qpos + timestep * velocity, velocity, state.warmstart)
+
+    running = {}
+    for physics, count in ((p, n) for p in ("mjx", "handwritten") for n in seed_counts):
+        chosen = dataclasses.replace(learner, one_step=by_hand if physics == "handwritten" else None)
+        state = jax.vmap(functools.partial(start, chosen))(jnp.arange(count))
+        program = compiled_chunk(chosen, UPDATES).lower(state, data).compile()
+        running[physics, count] = (program, program(state, data)[0])
+    times: dict[tuple[str, int], list[float]] = {key: [] for key in running}
+    for _ in range(rounds):
+        for key, (program, state) in running.items():
+            begin = time.perf_counter()
+            running[key] = (program, jax.block_until_ready(program(state, data)[0]))
+            times[key].append(time.perf_counter() - begin)
+    return [
+        {"scene": "double_goal", "method": method, "physics": physics, "seeds": count, "ms": 1e3 * float(np.median(spent)) / UPDATES}
+        for (physics, count), spent in times.items()
+    ]
+
+
+def updates_table(rows: Sequence[dict[str, object]]) -> Table:
+    """Whole updates, with their ratio to the hand-written physics and to one seed."""
+    ms = {(r["physics"], r["seeds"]): float(str(r["ms"])) for r in rows}
+    out = Table(title=f"One update of {rows[0]['method']} on {rows[0]['scene']}")
+    for column in ("physics", "seeds", "ms", "x handwritten", "x one seed"):
+        out.add_column(column, justify="left" if column == "physics" else "right")
+    for (physics, seeds), spent in ms.items():
+        floor, one = ms["handwritten", seeds], ms[physics, 1]
+        out.add_row(str(physics), str(seeds), f"{spent:.1f}", f"{spent / floor:.2f}", f"{spent / one:.2f}")
+    return out
+
+
 def first_result_seconds(world_name: str) -> float:
     """From calling for a specialised step to the first gradient of a batch of 64, in a process that finds a warm cache."""
     seconds = 0.0
@@ -254,6 +301,7 @@ def arguments() -> argparse.ArgumentParser:
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all rows as JSON")
     parser.add_argument("--figure", type=Path, metavar="FILE.png", help="draw throughput against batch size")
+    parser.add_argument("--parts", metavar="LIST", help=f"comma-separated, of {','.join(PARTS)} (default all; with --quick not update)")
     parser.add_argument("--worlds", default=",".join(WORLDS), help="comma-separated, of %(default)s")
     parser.add_argument("--batches", default=",".join(map(str, BATCHES)), help="comma-separated batch sizes (default %(default)s)")
     parser.add_argument("--rounds", type=int, default=7, help="timed rounds, of which the median counts (default %(default)s)")
@@ -270,7 +318,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         _names(options.first_result)
         sys.stdout.write(f"{_first_result(options.first_result)}\n")
         return
-    names, batches = _names(options.worlds), [64] if options.quick else _batches(options.batches)
+    parts, names = _parts(options.parts or ",".join(PARTS[: 2 if options.quick else 3])), _names(options.worlds)
+    batches = [64] if options.quick else _batches(options.batches)
     if options.rounds < 1:
         raise UsageError(f"--rounds {options.rounds}: at least 1 is needed")
     for path in (options.json, options.figure):
@@ -278,29 +327,48 @@ def main(argv: Sequence[str] | None = None) -> None:
             raise UsageError(f"{path}: there is no folder {path.absolute().parent}")
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are measured
     rounds = 3 if options.quick else options.rounds
-    console, rows = Console(width=None if sys.stdout.isatty() else 130), []
+    console = Console(width=None if sys.stdout.isatty() else 130)
+    report: dict[str, Any] = {"rows": [], "pile_up": {}, "update": [], "warm_first_result_s": {}}
+    if "physics" in parts:
+        rows = _physics(console, names, batches, rounds, plain=not options.quick)
+        report["rows"] = [vars(r) for r in rows]
+        console.print(table(rows))
+        if options.figure:
+            figure(rows, options.figure)
+    if "pile_up" in parts:
+        report["pile_up"] = pile_up.compare()
+        console.print(pile_up.table(report["pile_up"]))
+    if "update" in parts:
+        report["update"] = updates("rtc_c", rounds)
+        console.print(updates_table(report["update"]))
+    if not options.quick and "physics" in parts:
+        report["warm_first_result_s"] = {name: first_result_seconds(name) for name in names}
+        for name, seconds in report["warm_first_result_s"].items():
+            console.print(f"{name}: first gradient {seconds:.1f} s after the call, with a warm compilation cache")
+    if options.json:
+        options.json.write_text(json.dumps(report, indent=1))
+
+
+def _physics(console: Console, names: Sequence[str], batches: Sequence[int], rounds: int, plain: bool) -> list[Row]:
+    """All rows; the plain variant's compilation alone takes minutes, so it can be left out."""
+    rows, variants = [], [v for v in VARIANTS if plain or v != "plain"]
     with Progress(console=console, transient=True) as progress:
-        task = progress.add_task("benchmark", total=len(names) * len(batches) * len(DIRECTIONS) + 1)
+        task = progress.add_task("benchmark", total=len(names) * len(batches) * len(DIRECTIONS))
         for name in names:
             world = WORLDS[name]()
             for batch, direction in ((b, d) for b in batches for d in DIRECTIONS):
                 progress.update(task, description=f"{name}, batch {batch}, {direction}")
-                variants = [v for v in VARIANTS if not options.quick or v != "plain"]  # its compilation alone takes minutes
                 rows += measure(name, world, batch, direction, rounds, variants)
                 progress.advance(task)
-        progress.update(task, description="pile-up")
-        errors = pile_up.compare()
-        progress.advance(task)
-    console.print(table(rows))
-    console.print(pile_up.table(errors))
-    warm = {} if options.quick else {name: first_result_seconds(name) for name in names}
-    for name, seconds in warm.items():
-        console.print(f"{name}: first gradient {seconds:.1f} s after the call, with a warm compilation cache")
-    if options.json:
-        report = {"rows": [vars(r) for r in rows], "pile_up": errors, "update": [], "warm_first_result_s": warm}
-        options.json.write_text(json.dumps(report, indent=1))
-    if options.figure:
-        figure(rows, options.figure)
+    return rows
+
+
+def _parts(text: str) -> list[str]:
+    parts = text.split(",")
+    unknown = [p for p in parts if p not in PARTS]
+    if unknown:
+        raise UsageError(f"--parts: no part '{unknown[0]}'; there are {', '.join(PARTS)}")
+    return parts
 
 
 def _names(text: str) -> list[str]:

@@ -162,6 +162,16 @@ def train_step(learner: Learner, state: TrainState, expert: Demonstration) -> tu
     return TrainState(optax.apply_updates(state.networks, step), optimiser, state.seed, state.update + 1), report
 
 
+def compiled_chunk(learner: Learner, length: int) -> jax.stages.Wrapped:
+    """`length` updates of all seeds as one program; returns the means of what the updates report."""
+
+    def one_seed(state: TrainState, expert: Demonstration) -> tuple[TrainState, dict[str, Array]]:
+        state, seen = lax.scan(lambda s, _: train_step(learner, s, expert), state, length=length)
+        return state, jax.tree.map(jnp.mean, seen)
+
+    return jax.jit(jax.vmap(one_seed, in_axes=(0, None)), donate_argnums=0)
+
+
 def gradients(learner: Learner, networks: Networks, batch: Demonstration, key: Array, update: Array) -> tuple[Networks, dict[str, Array]]:
     """The gradient of all losses on a minibatch, in the two stages that the module's docstring tells; and what to log."""
     types, play, extra, glance = random.split(key, 4)
@@ -169,13 +179,16 @@ def gradients(learner: Learner, networks: Networks, batch: Demonstration, key: A
     now = infer(learner, held, batch, types)
     played, pull = play_together(learner, held, batch, now, play)
 
-    def by_rollouts(tracks: Trajectory) -> Array:
-        lost = branch_losses(learner, held, batch, now, Played(tracks, played.alive), extra, CLOSED_LOOP)
-        return learner.weights.total(lost, update)
-
-    cotangents, guarded = jnp.zeros(()), {}
+    cotangents: Array = jnp.zeros(())
+    guarded: dict[str, Array] = {}
     if played is not None:
-        cotangents, guarded = guard(pull(jax.grad(by_rollouts)(played.tracks)), played.alive, learner.optimiser.trajectory_clip)
+        alive = played.alive
+
+        def by_rollouts(tracks: Trajectory) -> Array:
+            lost = branch_losses(learner, held, batch, now, Played(tracks, alive), extra, CLOSED_LOOP)
+            return learner.weights.total(lost, update)
+
+        cotangents, guarded = guard(pull(jax.grad(by_rollouts)(played.tracks)), alive, learner.optimiser.trajectory_clip)
 
     def total(networks: Networks) -> tuple[Array, dict[str, Array]]:
         agent = learner.agent(networks)

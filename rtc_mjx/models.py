@@ -26,6 +26,7 @@ class ModelOptions:
 
     Attributes:
         width: units of a hidden layer.
+        discriminator_width: units of a hidden layer of the discriminator.
         depth: hidden layers of each network.
         mixture: components of the policy's Gaussian mixture.
         choice_gradient: whether what a rollout loses moves the weights of the mixture, by the biased straight-through estimator;
@@ -37,6 +38,7 @@ class ModelOptions:
     """
 
     width: int = 64
+    discriminator_width: int = 64
     depth: int = 2
     mixture: int = 2
     choice_gradient: bool = True
@@ -191,7 +193,7 @@ def make_networks(key: Array, scene: Scene, features: int, space: TypeSpace, opt
         "policy": lambda: MLP([features + space.size, *hidden, policy_outputs(options, controls)], rngs),
         "encoder": lambda: Encoder(pair, space.posterior_outputs, options.width, options.depth, rngs),
         "prior": lambda: jax.random.normal(rngs(), (space.prior_outputs,)),
-        "discriminator": lambda: MLP([pair, *hidden, 1], rngs),
+        "discriminator": lambda: MLP([pair, *[options.discriminator_width] * options.depth, 1], rngs),
         "inference": lambda: MLP([pair, *hidden, space.posterior_outputs], rngs),
     }
     return Networks(**{name: build() if name in parts | {"policy"} else None for name, build in builders.items()})

@@ -44,9 +44,10 @@ class Run:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise UsageError(f"--run {folder} exists: go on with --resume, or name another")
         try:
-            for part in ("checkpoints", "media"):
-                (folder / part).mkdir(parents=True, exist_ok=True)
+            folder.mkdir(parents=True, exist_ok=True)
             settings.write(config, folder)
+            for part in ("checkpoints", "media"):
+                (folder / part).mkdir()
         except OSError as error:
             raise UsageError(f"--run {folder}: {error.strerror}") from error
         return cls(folder, config)

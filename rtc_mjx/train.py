@@ -10,21 +10,17 @@ import functools
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jax import random
 
 from rtc_mjx import cache, cli, config, dataset, evaluate
 from rtc_mjx.config import Config
-from rtc_mjx.learner import Learner, TrainState, start, train_step
+from rtc_mjx.learner import Learner, TrainState, compiled_chunk, start
 from rtc_mjx.progress import Reporter
 from rtc_mjx.runs import Run
-from rtc_mjx.trajectory import Demonstration
-
-Chunk = Callable[[TrainState, Demonstration], tuple[TrainState, dict[str, jax.Array]]]
 
 
 def train(config: Config) -> Run:
@@ -40,18 +36,19 @@ def train(config: Config) -> Run:
     learner = evaluate.learner_for(config, expert)
     state, update, before = begin(run, learner, config)
     test = Tests(config, learner)
-    chunk, data = compiled_chunk(learner, config.every.log), evaluate.without_truth(expert)
+    chunks, data = functools.cache(functools.partial(compiled_chunk, learner)), evaluate.without_truth(expert)
     started = time.perf_counter() - before
     with Reporter(run, config, update) as report, Interruption() as interrupted:
         while update < config.updates:
-            state, seen = chunk(state, data)
-            update += config.every.log
+            length = min(config.every.log, config.updates - update)
+            state, seen = chunks(length)(state, data)
+            update += length
             line: dict[str, Any] = {"update": update, "wall_s": time.perf_counter() - started, "env_steps": env_steps(learner, update)}
             line |= as_lists(seen)
-            if update % config.every.test == 0 or update >= config.updates:
+            if update % config.every.test == 0 or update == config.updates:
                 line |= test(state)
             report(line)
-            if update % config.every.save == 0 or update >= config.updates or interrupted:
+            if update % config.every.save == 0 or update == config.updates or interrupted:
                 run.save(update, state, line["wall_s"])
             if interrupted:
                 raise KeyboardInterrupt
@@ -68,16 +65,6 @@ def begin(run: Run, learner: Learner, config: Config) -> tuple[TrainState, int, 
     run.rewind(update)
     run.discard_after(update)
     return state, update, wall
-
-
-def compiled_chunk(learner: Learner, length: int) -> Chunk:
-    """`length` updates of all seeds as one program; returns the means of what the updates report."""
-
-    def one_seed(state: TrainState, expert: Demonstration) -> tuple[TrainState, dict[str, jax.Array]]:
-        state, seen = jax.lax.scan(lambda s, _: train_step(learner, s, expert), state, length=length)
-        return state, jax.tree.map(jnp.mean, seen)
-
-    return jax.jit(jax.vmap(one_seed, in_axes=(0, None)), donate_argnums=0)
 
 
 class Tests:
