@@ -99,11 +99,12 @@ class Config:
 
 
 LEAST = {
-    "seeds": 1, "first_seed": 0, "updates": 1, "batch": 4,
-    "model.width": 1, "model.discriminator_width": 1, "model.depth": 1, "model.mixture": 1, "model.type_size": 1, "model.type_count": 2, "model.prior_components": 1,
-    "losses.adversarial_ramp": 0, "losses.type_kl_ramp": 0, "optimiser.discriminator_steps": 0, "experts.train": 4, "experts.test": 4,
-    "every.log": 1, "every.test": 1, "every.save": 1, "scene.steps": 1,
-}  # fmt: skip
+    **dict.fromkeys(("updates", "seeds", "every.log", "every.test", "every.save", "scene.steps"), 1),
+    **{f"model.{name}": 1 for name in ("width", "discriminator_width", "depth", "mixture", "type_size", "prior_components")},
+    **dict.fromkeys(("batch", "experts.train", "experts.test"), 4),
+    **dict.fromkeys(("first_seed", "losses.adversarial_ramp", "losses.type_kl_ramp", "optimiser.discriminator_steps"), 0),
+    "model.type_count": 2,
+}
 POSITIVE = (
     "model.smallest_scale",
     "optimiser.learning_rate",

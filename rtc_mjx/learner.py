@@ -163,13 +163,20 @@ def train_step(learner: Learner, state: TrainState, expert: Demonstration) -> tu
 
 
 def compiled_chunk(learner: Learner, length: int) -> jax.stages.Wrapped:
-    """`length` updates of all seeds as one program; returns the means of what the updates report."""
+    """`length` updates of all seeds as one program; returns the means of what the updates report.
 
-    def one_seed(state: TrainState, expert: Demonstration) -> tuple[TrainState, dict[str, Array]]:
-        state, seen = lax.scan(lambda s, _: train_step(learner, s, expert), state, length=length)
-        return state, jax.tree.map(jnp.mean, seen)
+    On a CPU one seed already fills the matrix units, and all seeds' activations together would not fit its caches: there seeds take
+    turns within the program. Elsewhere they are one more axis.
+    """
 
-    return jax.jit(jax.vmap(one_seed, in_axes=(0, None)), donate_argnums=0)
+    def all_seeds(states: TrainState, expert: Demonstration) -> tuple[TrainState, dict[str, Array]]:
+        def one_seed(state: TrainState) -> tuple[TrainState, dict[str, Array]]:
+            state, seen = lax.scan(lambda s, _: train_step(learner, s, expert), state, length=length)
+            return state, jax.tree.map(jnp.mean, seen)
+
+        return lax.map(one_seed, states) if jax.default_backend() == "cpu" else jax.vmap(one_seed)(states)
+
+    return jax.jit(all_seeds, donate_argnums=0)
 
 
 def gradients(learner: Learner, networks: Networks, batch: Demonstration, key: Array, update: Array) -> tuple[Networks, dict[str, Array]]:

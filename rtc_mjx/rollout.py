@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from rtc_mjx.physics import OneStep, PhysicsState, control_step, specialised_step
+from rtc_mjx.physics import SOLUTION, OneStep, PhysicsState, control_step, specialised_step
 from rtc_mjx.scenes import Actor, Scene
 from rtc_mjx.trajectory import Episode, Trajectory
 
@@ -51,6 +51,9 @@ def rollout(
         after = advance(damp(state, 0.0 if gradient == "none" else decay), action, around)
         return (memory, after), (state, seen, action)
 
+    # A backward pass keeps what steps hand on and the contact solutions; what the actor computed is computed again: it is cheaper
+    # than writing and reading all activations of all episodes.
+    body = jax.checkpoint(body, policy=jax.checkpoint_policies.save_only_these_names(SOLUTION))
     during = jax.tree.map(lambda x: x[:-1], episode.surroundings)
     inputs = (jnp.arange(scene.steps), during, actor.noise)
     (_, last), (states, seen, actions) = lax.scan(body, (actor.memory, episode.start), inputs)

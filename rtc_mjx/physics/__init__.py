@@ -1,5 +1,6 @@
 """Worlds written in MJCF, stepped by MuJoCo MJX and differentiated exactly, contacts included."""
 
+from rtc_mjx.physics.contact import SOLUTION
 from rtc_mjx.physics.fast import specialised_step
 from rtc_mjx.physics.rollout import OneStep, check_inputs, control_step, simulate
 from rtc_mjx.physics.step import (
@@ -14,7 +15,7 @@ from rtc_mjx.physics.step import (
 from rtc_mjx.physics.world import World, asset_names, assets, from_spec, load
 
 __all__ = [
-    "OneStep", "PhysicsState", "Surroundings", "World", "asset_names", "assets", "check_inputs", "constraint_rows",
+    "SOLUTION", "OneStep", "PhysicsState", "Surroundings", "World", "asset_names", "assets", "check_inputs", "constraint_rows",
     "contact_problem", "control_step", "from_spec", "load", "rest_state", "rest_surroundings", "simulate",
     "specialised_step", "step",
 ]  # fmt: skip
