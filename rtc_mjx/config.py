@@ -267,16 +267,17 @@ def check(config: Config) -> Config:
     """
     values = flat(to_dict(config))
     for name, value in values.items():
+        option = f"--{name.replace('_', '-')} {value}"
         if isinstance(value, float) and value != value:
-            raise UsageError(f"--{name} {value}: a number is needed")
+            raise UsageError(f"{option}: a number is needed")
         if name in LEAST and value < LEAST[name]:
-            raise UsageError(f"--{name} {value}: at least {LEAST[name]} is needed")
+            raise UsageError(f"{option}: at least {LEAST[name]} is needed")
         if name in POSITIVE and not 0 < value < float("inf"):
-            raise UsageError(f"--{name} {value}: a positive number is needed")
+            raise UsageError(f"{option}: a positive number is needed")
         if name in NOT_NEGATIVE and not 0 <= value < float("inf"):
-            raise UsageError(f"--{name} {value}: a number from 0 on is needed")
+            raise UsageError(f"{option}: a number from 0 on is needed")
         if name in SHARES and not 0 <= value <= 1:
-            raise UsageError(f"--{name} {value}: a number between 0 and 1 is needed")
+            raise UsageError(f"{option}: a number between 0 and 1 is needed")
     for name in ("test", "save"):
         if values[f"every.{name}"] % config.every.log:
             raise UsageError(f"--every.{name} {values[f'every.{name}']}: a multiple of --every.log {config.every.log} is needed")

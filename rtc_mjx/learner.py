@@ -158,7 +158,8 @@ def train_step(learner: Learner, state: TrainState, expert: Demonstration) -> tu
     batch = jax.tree.map(lambda x: x[rows], expert)
     gradient, report = gradients(learner, state.networks, batch, key, state.update)
     step, optimiser = transformation(learner).update(gradient, state.optimiser, state.networks)
-    report |= {"gradient_norm": optax.tree.norm(gradient.policy)}
+    parts = {part: value for part, value in vars(gradient).items() if value is not None}
+    report |= {f"gradient_norm_{part}": optax.tree.norm(value) for part, value in parts.items()}  # raw: before any clipping
     return TrainState(optax.apply_updates(state.networks, step), optimiser, state.seed, state.update + 1), report
 
 

@@ -7,6 +7,7 @@ run that was killed and resumed writes the same metrics.jsonl (but for wall_s) a
 """
 
 import functools
+import math
 import signal
 import sys
 import time
@@ -18,6 +19,7 @@ from jax import random
 
 from rtc_mjx import cache, cli, config, dataset, evaluate
 from rtc_mjx.config import Config
+from rtc_mjx.errors import RunError
 from rtc_mjx.learner import Learner, TrainState, compiled_chunk, start
 from rtc_mjx.progress import Reporter
 from rtc_mjx.runs import Run
@@ -45,6 +47,7 @@ def train(config: Config) -> Run:
             update += length
             line: dict[str, Any] = {"update": update, "wall_s": time.perf_counter() - started, "env_steps": env_steps(learner, update)}
             line |= as_lists(seen)
+            check_finite(line, run)
             if update % config.every.test == 0 or update == config.updates:
                 line |= test(state)
             report(line)
@@ -93,6 +96,16 @@ def env_steps(learner: Learner, update: int) -> int:
 def as_lists(seen: dict[str, jax.Array]) -> dict[str, list[float]]:
     """Numbers per seed, in the order of their names."""
     return {name: [float(x) for x in values] for name, values in sorted(jax.device_get(seen).items())}
+
+
+def check_finite(line: dict[str, Any], run: Run) -> None:
+    """Raises RunError where a seed has diverged: going on would only write NaN."""
+    bad = [(name, seed) for name, x in line.items() if isinstance(x, list) for seed, v in enumerate(x) if not math.isfinite(v)]
+    if bad:
+        name, seed = bad[0]
+        whole = next(run.checkpoints(), None)
+        kept = f"the last checkpoint is of update {whole}" if whole is not None else "there is no checkpoint yet"
+        raise RunError(f"update {line['update']}: {name} of seed {seed} is not finite; {kept}; a lower learning rate may help")
 
 
 class Interruption:

@@ -30,6 +30,12 @@ def test_specialising_is_worth_it(rows):
     assert rate["specialised", "gradient"] > 5 * rate["native", "gradient"]
 
 
+def test_whole_updates_are_measured_on_both_physics():
+    held = benchmark.updates("mgail", rounds=1, seed_counts=(1,))
+    assert {r["physics"] for r in held} == {"mjx", "handwritten"} and all(r["ms"] > 0 for r in held)
+    assert benchmark.updates_table(held).row_count == 2
+
+
 def test_the_figure_is_drawn(rows, tmp_path):
     benchmark.figure(rows, tmp_path / "speed.png")
     assert (tmp_path / "speed.png").read_bytes().startswith(b"\x89PNG")

@@ -99,6 +99,21 @@ def test_prior_gets_no_gradient_from_adversarial_loss(method):
 
 
 @pytest.mark.parametrize("method", ["rtc_c", "rtc_d"])
+def test_rollouts_of_both_branches_are_fakes_for_the_discriminator(method):
+    held = learner(method)
+    state, batch = begin(held)
+    agent = held.agent(state.networks)
+    played, _ = learning.play_together(held, agent, batch, learning.infer(held, agent, batch, random.key(1)), random.key(2))
+    assert len(played.alive) == held.batch
+    first, second = (
+        learning.critic_loss(held, agent, batch, Played(played.tracks, played.alive & rows), random.key(3))[0]
+        for rows in (jnp.arange(held.batch) < held.batch // 2, jnp.arange(held.batch) >= held.batch // 2)
+    )
+    both = learning.critic_loss(held, agent, batch, played, random.key(3))[0]
+    assert both == pytest.approx(float(first + second) / 2, rel=1e-5) and abs(float(first - second)) > 1e-6
+
+
+@pytest.mark.parametrize("method", ["rtc_c", "rtc_d"])
 def test_encoder_gets_no_gradient_from_the_prior_branch(method):
     held = learner(method, weights=only(adversarial=1.0), share=0.0)
     state, batch = begin(held)

@@ -67,6 +67,12 @@ def test_interrupted_run_resumes_bit_for_bit(whole, tmp_path, monkeypatch):
     assert lines(resumed) == lines(whole)
 
 
+def test_a_training_that_diverges_says_so_and_keeps_its_checkpoints(tmp_path):
+    wild = dataclasses.replace(settings("bc").optimiser, learning_rate=1e30, clip=1e30)
+    with pytest.raises(RunError, match=r"update 10: .* of seed 0 is not finite.*learning rate"):
+        train.train(settings("bc", tmp_path / "run", optimiser=wild))
+
+
 def test_ctrl_c_saves_a_checkpoint_first(tmp_path, monkeypatch):
     logged = Run.log
 
@@ -103,7 +109,19 @@ def test_a_run_describes_itself(whole):
     assert any(p.name.startswith("events.out.tfevents") for p in whole.folder.iterdir())
     assert config.to_dict(Run.open(whole.folder).config) == config.to_dict(whole.config)
     line = whole.metrics()[-1]
-    assert {"update", "wall_s", "env_steps", "gradient_norm", "accuracy_expert", "accuracy_policy", "type_kl", "return"} <= set(line)
+    assert {
+        "update",
+        "wall_s",
+        "env_steps",
+        "gradient_norm_policy",
+        "gradient_norm_encoder",
+        "gradient_norm_prior",
+        "gradient_norm_discriminator",
+        "accuracy_expert",
+        "accuracy_policy",
+        "type_kl",
+        "return",
+    } <= set(line)
     assert all(len(v) == 2 for v in line.values() if isinstance(v, list))
 
 
@@ -258,12 +276,12 @@ def refused(argv, named):
         (["--updates", "many"], "updates.*many"),
         (["--losses.adversaria", "1"], r"adversaria.*--losses\.adversarial"),
         (["--losses.adversarial", "-1"], "adversarial -1.*from 0"),
-        (["--losses.type-kl", "nan"], "type_kl nan"),
-        (["--encoder-share", "1.5"], r"encoder_share 1\.5.*between 0 and 1"),
+        (["--losses.type-kl", "nan"], "type-kl nan"),
+        (["--encoder-share", "1.5"], r"encoder-share 1\.5.*between 0 and 1"),
         (["--encoder-share", "0", "--method", "rtc"], "encoder-share.*both parts"),
         (["--every.test", "150"], r"every\.test 150.*multiple"),
         (["--losses.kl-direction", "sideways"], "sideways"),
-        (["--optimiser.learning-rate", "0"], "learning_rate 0.*positive"),
+        (["--optimiser.learning-rate", "0"], "learning-rate 0.*positive"),
         (["--scene"], "scene"),
         (["--resume"], "--run"),
     ],
