@@ -73,7 +73,7 @@ def stage(world: World, body: str, actors: int, marks: int) -> mujoco.MjModel:
                 )
         for mark in range(marks):
             dot = spec.worldbody.add_body(name=f"mark{actor}_{mark}", mocap=True, pos=[0, 0, AWAY])
-            size = [0.014 if actor else 0.01] * 3
+            size = [0.018 if actor else 0.013] * 3
             dot.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=size, rgba=[*colours[actor], 1], contype=0, conaffinity=0)
     return spec.compile()
 

@@ -184,6 +184,14 @@ def test_both_goals_are_equally_easy():
     assert abs(returns[0].mean() - returns[1].mean()) < 3 * np.hypot(*(r.std() / np.sqrt(len(r)) for r in returns))
 
 
+def test_expert_turns_left_as_often_as_right_to_either_goal():
+    held = experts("double_goal")
+    features = jax.vmap(made("double_goal").features)(held.episode, held.trajectory)
+    left, upper = np.asarray(features["left"]) == 1, np.asarray(features["upper"]) == 1
+    assert np.mean(left == (held.truth["bend"] < 0)) > 0.95  # it heads off to one side and comes back by turning to the other
+    assert abs(np.mean(left[upper]) - 0.5) < 0.15 and abs(np.mean(left[~upper]) - 0.5) < 0.1
+
+
 def test_return_counts_steps_at_a_goal():
     """By hand: placed on a goal for three of four steps, a little more than 0.1 m off in the last."""
     scene = DoubleGoal(steps=4)

@@ -32,6 +32,7 @@ BEND = (0.7, 1.0)  # rad, how far off the straight line it heads at first, to ei
 BEND_WITHIN = 0.9  # m, from its goal, where it begins to turn in
 GAIN = 1.2  # control per m/s of velocity error
 TREMOR = 0.1  # standard deviation of the expert's controls
+TURNING = 20  # steps after that in which its path bends
 UNDECIDED = 10  # steps during which the goal is redrawn
 LOWER, UPPER = 0, 1
 
@@ -100,15 +101,26 @@ class DoubleGoal(Scene):
         """The double goal problem has no hand-made label: Symphony does not run on it."""
 
     def features(self, episode: Episode, trajectory: Trajectory) -> dict[str, Array]:
-        """Steps spent at either goal, and the side on which the episode ends: h = sign(y_T) (paper, section V-A)."""
+        """Steps spent at either goal, the side on which the episode ends, h = sign(y_T) (paper, section V-A), and the way its path turns.
+
+        The turn is not in the paper: like the goal it is the expert's own choice, half left and half right, and a population has both.
+        """
+        way = jnp.diff(trajectory.states.qpos, axis=0)
+        turn = way[:-1, 0] * way[1:, 1] - way[:-1, 1] * way[1:, 0]  # positive to the left
         rewards = jax.vmap(self.reward, in_axes=(None, 0, 0))(episode, jnp.arange(self.steps + 1), trajectory.states)
-        return {"return": jnp.sum(rewards[1:]), "upper": (trajectory.states.qpos[-1, 1] > 0).astype(int)}
+        return {
+            "return": jnp.sum(rewards[1:]),
+            "upper": (trajectory.states.qpos[-1, 1] > 0).astype(int),
+            "left": (jnp.sum(turn[UNDECIDED : UNDECIDED + TURNING]) > 0).astype(int),
+        }
 
     def metrics(self, features: dict[str, np.ndarray], expert: dict[str, np.ndarray]) -> dict[str, float]:
-        """Mean return in steps, and the Jensen-Shannon divergence in bits of h from the expert's."""
+        """Mean return in steps; Jensen-Shannon divergence in bits from the expert's of h, and of goal and turn together; share lower."""
+        both, experts = (2 * f["upper"] + f["left"] for f in (features, expert))
         return {
             "return": float(np.mean(features["return"])),
             "jsd_goal": metrics.jsd(features["upper"], expert["upper"], bins=2, limits=(-0.5, 1.5)),
+            "jsd_goal_and_turn": metrics.jsd(both, experts, bins=4, limits=(-0.5, 3.5)),
             "lower": float(1 - np.mean(features["upper"])),
         }
 
