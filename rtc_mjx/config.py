@@ -102,7 +102,9 @@ LEAST = {
     **dict.fromkeys(("updates", "seeds", "every.log", "every.test", "every.save", "scene.steps"), 1),
     **{f"model.{name}": 1 for name in ("width", "discriminator_width", "depth", "mixture", "type_size", "prior_components")},
     **dict.fromkeys(("batch", "experts.train", "experts.test"), 4),
-    **dict.fromkeys(("first_seed", "losses.adversarial_ramp", "losses.type_kl_ramp", "optimiser.discriminator_steps"), 0),
+    **dict.fromkeys(
+        ("first_seed", "losses.adversarial_start", "losses.adversarial_ramp", "losses.type_kl_ramp", "optimiser.discriminator_steps"), 0
+    ),
     "model.type_count": 2,
 }
 POSITIVE = (

@@ -30,7 +30,8 @@ class LossWeights:
         cloning: behaviour cloning on the demonstration.
         reconstruction: the paper's L_rec.
         adversarial: the paper's lambda.
-        adversarial_ramp: updates over which lambda rises linearly from zero.
+        adversarial_start: updates before lambda begins to rise; the discriminator learns from the first one on.
+        adversarial_ramp: updates over which lambda then rises linearly from zero.
         type_kl: the paper's beta.
         type_kl_ramp: updates over which beta rises linearly from zero.
         type_info: InfoMGAIL's mutual-information term.
@@ -42,6 +43,7 @@ class LossWeights:
     cloning: float = 1.0
     reconstruction: float = 1.0
     adversarial: float = 0.3
+    adversarial_start: int = 0
     adversarial_ramp: int = 1000
     type_kl: float = 0.01
     type_kl_ramp: int = 0
@@ -53,9 +55,9 @@ class LossWeights:
     def total(self, losses: dict[str, Array], update: Array) -> Array:
         """The weighted sum at an update, lambda and beta ramped."""
 
-        def weight(name: str) -> Array | float:
-            ramp = getattr(self, f"{name}_ramp", 0)
-            return getattr(self, name) * (jnp.minimum(1.0, (update + 1) / ramp) if ramp else 1.0)
+        def weight(name: str) -> Array:
+            first, ramp = getattr(self, f"{name}_start", 0), getattr(self, f"{name}_ramp", 0)
+            return getattr(self, name) * jnp.clip((update + 1 - first) / max(1, ramp), 0, 1)
 
         return sum((weight(name) * value for name, value in losses.items()), jnp.zeros(()))
 

@@ -271,6 +271,12 @@ def test_weights_ramp_linearly(name):
     assert np.allclose(at, [0.2, 1.0, 2.0, 2.0])
 
 
+def test_lambda_waits_for_its_start():
+    weights = only(adversarial=2.0, adversarial_ramp=10, adversarial_start=5)
+    at = [float(weights.total({"adversarial": jnp.array(1.0)}, jnp.array(update))) for update in (0, 4, 5, 9, 14, 50)]
+    assert np.allclose(at, [0, 0, 0.2, 1.0, 2.0, 2.0])
+
+
 def test_every_loss_is_used_and_every_used_loss_is_known():
     used = {loss for method in METHODS.values() for branch in method.branches for loss in branch.losses}
     assert used == set(LOSSES) and used <= {f.name for f in dataclasses.fields(LossWeights)}
