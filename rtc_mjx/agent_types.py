@@ -97,7 +97,7 @@ class Continuous:
         return self.components * (1 + 2 * self.size)
 
     def posterior(self, outputs: Array) -> Gaussian:
-        """A Gaussian whose scale stays between SMALLEST_SCALE and about 1 at outputs near zero."""
+        """A Gaussian whose scale is at least SMALLEST_SCALE, and near 0.7 at outputs of zero."""
         mean, raw = jnp.split(outputs, 2, axis=-1)
         return Gaussian(mean, scale_of(raw))
 

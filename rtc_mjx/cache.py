@@ -1,4 +1,4 @@
-"""What is kept between runs, under the user's cache folder: compiled programs, demonstrations, folded physics."""
+"""What is kept between runs, under the user's cache folder: compiled programs and demonstrations."""
 
 import os
 import zipfile

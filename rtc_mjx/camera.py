@@ -4,18 +4,15 @@ The ray caster needs no system library: `mj_multiRay` finds what each pixel sees
 boxes, cylinders and planes in their own colours, with a headlight.
 """
 
-import contextlib
 import functools
 import logging
-import sys
-from collections.abc import Iterator
 from typing import Any, Protocol
 
 import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from rtc_mjx.errors import UsageError
+from rtc_mjx.errors import UsageError, quiet_destructors
 
 Picture = UInt8[np.ndarray, "height width 3"]
 SKY = np.array([0.78, 0.85, 0.92])
@@ -38,22 +35,12 @@ def camera(model: mujoco.MjModel, name: str, height: int, width: int) -> Camera:
     names = [model.camera(i).name for i in range(model.ncam)]
     if name not in names:
         raise UsageError(f"--camera {name}: no such camera; there are {', '.join(names)}")
-    with _quiet_destructors():
+    with quiet_destructors():
         try:
             return GlCamera(model, name, height, width)
         except Exception as error:  # every platform and library fails in its own way; without OpenGL rays do
             _say_once(f"no OpenGL ({type(error).__name__}): pictures are ray-cast; MUJOCO_GL=egl or osmesa with its library is faster")
     return RayCamera(model, name, height, width)
-
-
-@contextlib.contextmanager
-def _quiet_destructors() -> Iterator[None]:
-    """A half-made OpenGL context fails again when it is freed; that says nothing new."""
-    before, sys.unraisablehook = sys.unraisablehook, lambda _: None
-    try:
-        yield
-    finally:
-        sys.unraisablehook = before
 
 
 @functools.cache

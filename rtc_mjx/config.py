@@ -9,6 +9,7 @@ import contextlib
 import dataclasses
 import io
 import json
+import os
 import tomllib
 import types
 import typing
@@ -78,7 +79,7 @@ class Config:
     """
 
     scene: Scene = field(default_factory=DoubleGoal)
-    method: str = "rtc"
+    method: str = "rtc_c"
     seeds: int = 1
     first_seed: int = 0
     updates: int = 4000
@@ -154,13 +155,23 @@ def defaults(scene: str, method: str) -> Config:
         return config
     try:
         table = tomllib.loads(file.read_text())
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:  # not TOML, or not text
         raise UsageError(f"{file}: {error}") from error
     by_method = table.pop("methods", {})
-    for name in by_method:
+    for name, held in by_method.items() if isinstance(by_method, Mapping) else [("methods", by_method)]:
+        if not isinstance(held, Mapping):
+            raise UsageError(f"{file}: '{name}' is a table, got {held!r}")
         if name not in METHODS:
             raise UsageError(f"{file}: [methods.{name}]: no such method; there are {', '.join(METHODS)}")
-    return check(merge(merge(config, table, str(file)), by_method.get(method, {}), f"{file} [methods.{method}]"))
+    for held in (table, *by_method.values()):
+        for key in ("method", "run", "resume"):
+            if key in held:
+                raise UsageError(f"{file}: '{key}' is chosen on the command line")
+    merged = merge(merge(config, table, str(file)), by_method.get(method, {}), f"{file} [methods.{method}]")
+    try:
+        return check(merged)
+    except UsageError as error:
+        raise UsageError(f"{file}: {error}") from error
 
 
 def _resumed(given: argparse.Namespace, argv: list[str], prog: str) -> Config:
@@ -213,11 +224,12 @@ DESCRIPTION = """Trains a method on a scene. `--scene NAME` and `--method NAME` 
 
 def _one_line(boxed: str, prog: str) -> str:
     """The first message of tyro's box, with the option it suggests."""
-    lines = [line.strip("│╭╮╰╯─ ").strip() for line in boxed.splitlines()]
-    lines = [line for line in lines[1:] if line]
-    options = [line.split()[0] for line in lines[1:] if line.startswith("--")]
-    near = f"; near it: {', '.join(dict.fromkeys(options[:3]))}" if "nrecognized" in (lines or [""])[0] and options else ""
-    return f"{prog}: {lines[0] if lines else boxed.strip()}{near} (see --help)"
+    lines = [line.strip("│╭╮╰╯ ").strip() for line in boxed.splitlines()[1:]]
+    rule = next((i for i, line in enumerate(lines) if set(line) <= {"─"}), len(lines))
+    message = " ".join(lines[:rule]) or boxed.strip()
+    options = [line.split()[0] for line in lines[rule:] if line.startswith("--")]
+    near = f"; near it: {', '.join(dict.fromkeys(options[:3]))}" if "nrecognized" in message and options else ""
+    return f"{prog}: {message}{near} (see --help)"
 
 
 def merge(settings: Any, table: Mapping[str, Any], where: str) -> Any:
@@ -283,6 +295,8 @@ def check(config: Config) -> Config:
     for name in ("test", "save"):
         if values[f"every.{name}"] % config.every.log:
             raise UsageError(f"--every.{name} {values[f'every.{name}']}: a multiple of --every.log {config.every.log} is needed")
+    if config.first_seed + config.seeds > 2**31:
+        raise UsageError(f"--first-seed {config.first_seed}: seeds below {2**31} are needed")
     split = round(config.batch * config.encoder_share)
     shares = {b.share for b in METHODS[method_name(config.method)].branches}
     if "rest" in shares and not 0 < split < config.batch:
@@ -310,7 +324,9 @@ def flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def write(config: Config, folder: Path) -> None:
     """Writes config.json."""
-    (folder / "config.json").write_text(json.dumps(to_dict(config), indent=1) + "\n")
+    part = folder / ".config.json.part"
+    part.write_text(json.dumps(to_dict(config), indent=1) + "\n")
+    os.replace(part, folder / "config.json")
 
 
 def read(folder: Path) -> Config:

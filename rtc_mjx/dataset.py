@@ -4,8 +4,10 @@ import dataclasses
 import hashlib
 import inspect
 import json
+import logging
 import os
 import tempfile
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -51,10 +53,14 @@ def demonstrations(scene: Scene, count: int, seed: int) -> Demonstration:
 
 
 def fingerprint(scene: Scene, count: int, seed: int) -> str:
-    """Hash of all that determines a set of demonstrations: settings, code of the scene, compiled world, precision, count, seed."""
+    """Hash of what determines a set of demonstrations: settings, code, compiled world, versions, precision, count, seed."""
+    here = Path(__file__).parent
+    code = [Path(inspect.getfile(type(scene))), *(here / name for name in ("dataset.py", "rollout.py", "scenes/base.py"))]
+    code += [*sorted((here / "physics").glob("*.py")), *sorted((here / "specialise").glob("*.py"))]
     made_by = {
         "settings": dataclasses.asdict(scene),
-        "code": hashlib.sha256(inspect.getsource(inspect.getmodule(type(scene))).encode()).hexdigest(),  # type: ignore[arg-type]
+        "code": hashlib.sha256(b"".join(file.read_bytes() for file in code)).hexdigest(),
+        "versions": [metadata.version(name) for name in ("jax", "mujoco", "mujoco-mjx")],
         "world": scene.world.fingerprint,
         "type": str(jnp.zeros(0).dtype),
         "count": count,
@@ -86,8 +92,15 @@ def _read(file: Path, shapes: list[jax.ShapeDtypeStruct]) -> list[np.ndarray] | 
 
 
 def _write(file: Path, leaves: list[np.ndarray]) -> None:
-    """Writes beside and renames, so that a reader or a second writer never sees half a file."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".part", delete=False) as part:
-        np.savez(part, allow_pickle=False, **{str(i): x for i, x in enumerate(leaves)})
-    os.replace(part.name, file)
+    """Writes beside and renames, so that a reader or a second writer never sees half a file; without a place to write, goes on."""
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".part", delete=False) as part:
+            try:
+                np.savez(part, allow_pickle=False, **{str(i): x for i, x in enumerate(leaves)})
+            except OSError:
+                os.unlink(part.name)
+                raise
+        os.replace(part.name, file)
+    except OSError as error:
+        logging.getLogger("rtc_mjx").warning("demonstrations cannot be kept in %s: %s", file.parent, error.strerror)

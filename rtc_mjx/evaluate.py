@@ -8,6 +8,7 @@ expert, and expert against expert at the same size, stand beside them: the ceili
 import argparse
 import functools
 import json
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,15 +24,16 @@ from rich.table import Table
 from rtc_mjx import cache, cli, dataset, metrics
 from rtc_mjx.agent_types import SOURCES
 from rtc_mjx.config import Config
-from rtc_mjx.errors import UsageError
-from rtc_mjx.learner import Learner, TrainState, start
+from rtc_mjx.errors import RunError, UsageError
+from rtc_mjx.learner import Learner, start
 from rtc_mjx.methods import METHODS, Method
 from rtc_mjx.models import Networks
 from rtc_mjx.runs import Run
-from rtc_mjx.trajectory import Demonstration
+from rtc_mjx.trajectory import Demonstration, Trajectory
 
 TRAIN_DATA, TEST_DATA, SECOND_TEST_DATA = 0, 1, 2  # seeds of demonstrations: independent sets
 NOISE = 7  # seed of the rollouts' noise
+FINITE = "finite"  # the feature that says whether a rollout is
 Features = dict[str, np.ndarray]
 
 
@@ -80,7 +82,7 @@ def roller(learner: Learner) -> Roll:
         }
         nudge = jnp.zeros((learner.scene.steps, agent.outputs))
         tracks = {name: learner.play(agent, mine.episode, ways[name]().agent_type, noise, nudge) for name in sources}
-        return {name: learner.scene.features(mine.episode, track) for name, track in tracks.items()}
+        return {name: learner.scene.features(mine.episode, track) | {FINITE: _finite(track)} for name, track in tracks.items()}
 
     def all_episodes(networks: Networks, test: Demonstration, key: Array) -> dict[str, dict[str, Array]]:
         other = jax.tree.map(lambda x: jnp.roll(x, 1, axis=0), test)
@@ -90,15 +92,25 @@ def roller(learner: Learner) -> Roll:
     return jax.jit(jax.vmap(all_episodes, in_axes=(0, None, None)))
 
 
+def _finite(track: Trajectory) -> Array:
+    return jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(track)]))
+
+
 def expert_features(config: Config, test: Demonstration) -> Features:
     """Features of the test demonstrations."""
     return jax.device_get(jax.jit(jax.vmap(config.scene.features))(test.episode, test.trajectory))
 
 
 def score(config: Config, features: dict[str, Features], expert: Features) -> dict[str, dict[str, list[float]]]:
-    """Metrics per type source, a list over seeds."""
+    """Metrics per type source, a list over seeds.
+
+    Raises:
+        RunError: a rollout is not finite; a mean over the others would hide it.
+    """
     out: dict[str, dict[str, list[float]]] = {}
     for source, arrays in features.items():
+        if not np.all(arrays[FINITE]):
+            raise RunError(f"{int(np.sum(~arrays[FINITE]))} of {arrays[FINITE].size} test rollouts under {source} types are not finite")
         rows = [config.scene.metrics({k: v[i] for k, v in arrays.items()}, expert) for i in range(config.seeds)]
         out[source] = {name: [row[name] for row in rows] for name in rows[0]}
     return out
@@ -117,7 +129,7 @@ def evaluate(run: Run, episodes: int) -> dict[str, Any]:
     tests = [dataset.demonstrations(config.scene, episodes, seed) for seed in (TEST_DATA, SECOND_TEST_DATA)]
     learner = learner_for(config, train)
     update, state, _ = run.restore(jax.eval_shape(jax.vmap(functools.partial(start, learner)), seeds_of(config)))
-    features = jax.device_get(roller(learner)(_networks(state), without_truth(tests[0]), random.key(NOISE)))
+    features = jax.device_get(roller(learner)(state.networks, without_truth(tests[0]), random.key(NOISE)))
     expert, second = (expert_features(config, test) for test in tests)
     table = score(config, features, expert)
     means = {source: {name: _summary(config, source, name, features, expert, table) for name in table[source]} for source in table}
@@ -131,10 +143,6 @@ def evaluate(run: Run, episodes: int) -> dict[str, Any]:
         "types": means,
         "reference": {"expert": config.scene.metrics(expert, expert), "expert_vs_expert": config.scene.metrics(second, expert)},
     }
-
-
-def _networks(state: TrainState) -> Networks:
-    return state.networks
 
 
 def _summary(
@@ -181,8 +189,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     cache.keep_compiled()
     run = Run.open(options.run)
     result = evaluate(run, options.episodes or run.config.experts.test)
-    (run.folder / "evaluation.json").write_text(json.dumps(result, indent=1) + "\n")
     Console(width=None if Console().is_terminal else 140).print(table(result))
+    part = run.folder / ".evaluation.json.part"
+    part.write_text(json.dumps(result, indent=1) + "\n")
+    os.replace(part, run.folder / "evaluation.json")
 
 
 if __name__ == "__main__":

@@ -43,7 +43,7 @@ class OptimiserOptions:
         discriminator_rate: Adam's, of discriminator and Q; constant.
         discriminator_steps: of each trajectory, at random times, that the discriminator learns from in an update; 0 for all.
         final_rate: share of the learning rate left at the last update.
-        clip: largest norm of an update's gradient, policy and discriminator apart.
+        clip: largest norm of an update's gradient: of policy and encoder, of the prior, of discriminator and Q.
         trajectory_clip: largest norm of one trajectory's gradient by the policy's outputs, in units of the minibatch's mean loss.
         gradient: what flows back from step to step of a rollout.
         decay: shrinks the backward signal at each step back in time.

@@ -57,9 +57,10 @@ def rollouts(run: Run, episodes: int, types: int, seed_index: int) -> tuple[Demo
     return shown, jax.device_get(jax.jit(jax.vmap(inner))(evaluate.without_truth(shown), keys))
 
 
-def stage(world: World, body: str, actors: int, marks: int) -> mujoco.MjModel:
+def stage(world: World, body: str, actors: int, marks: int, size: tuple[int, int]) -> mujoco.MjModel:
     """The world with a copy of the agent's body for each actor but the first, and marks for everyone's trail."""
     spec = world.spec.copy()
+    spec.visual.global_.offheight, spec.visual.global_.offwidth = size  # of what OpenGL draws into
     original = spec.body(body)
     colours = [EXPERT, *(PALETTE[i % len(PALETTE)] for i in range(actors - 1))]
     for geom in original.geoms:
@@ -73,8 +74,8 @@ def stage(world: World, body: str, actors: int, marks: int) -> mujoco.MjModel:
                 )
         for mark in range(marks):
             dot = spec.worldbody.add_body(name=f"mark{actor}_{mark}", mocap=True, pos=[0, 0, AWAY])
-            size = [0.018 if actor else 0.013] * 3
-            dot.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=size, rgba=[*colours[actor], 1], contype=0, conaffinity=0)
+            radius = [0.018 if actor else 0.013] * 3
+            dot.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=radius, rgba=[*colours[actor], 1], contype=0, conaffinity=0)
     return spec.compile()
 
 
@@ -95,7 +96,7 @@ def pictures(run: Run, shown: Demonstration, tracks: Trajectory, camera_name: st
     scene = run.config.scene
     world, body = scene.world, scene.agent_body
     actors, marks = tracks.actions.shape[1] + 1, scene.steps // EVERY + 1
-    model = stage(world, body, actors, marks)
+    model = stage(world, body, actors, marks, size)
     data, take = mujoco.MjData(model), None
     for episode in range(tracks.actions.shape[0]):
         expert = shown.trajectory.states.qpos[episode]
@@ -165,6 +166,9 @@ def main(argv: Sequence[str] | None = None) -> None:
             raise UsageError(f"--{name} {getattr(options, name)}: at least {least} is needed")
     if not 0 <= options.seed < run.config.seeds:
         raise UsageError(f"--seed {options.seed}: the run has seeds 0 to {run.config.seeds - 1}")
+    cameras = [c.name for c in run.config.scene.world.spec.cameras]
+    if options.camera not in cameras:
+        raise UsageError(f"--camera {options.camera}: no such camera; there are {', '.join(cameras)}")
     logging.basicConfig(format="%(message)s")
     cache.keep_compiled()
     shown, tracks = rollouts(run, options.episodes, options.types, options.seed)

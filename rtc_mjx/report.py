@@ -1,7 +1,7 @@
 """Tables and figures of runs side by side: learning curves (mean and standard deviation over seeds) and the last evaluation.
 
 `python -m rtc_mjx.report RUN... --out DIR` writes curves.png, table.md and results in one JSON file a method: evaluation.json with the
-settings, the versions and the commit that made it.
+settings, and the versions and the commit of the code that reports.
 """
 
 import argparse
@@ -35,9 +35,12 @@ def evaluation(run: Run) -> dict[str, Any]:
     if not file.is_file():
         raise UsageError(f"{run.folder} has no evaluation.json; make it with: python -m rtc_mjx.evaluate --run {run.folder}")
     try:
-        return json.loads(file.read_text())
+        held = json.loads(file.read_text())
     except ValueError as error:
         raise UsageError(f"{file} is damaged: {error}") from error
+    if not isinstance(held, dict) or not {"metrics", "types", "reference", "update", "seeds", "episodes"} <= set(held):
+        raise UsageError(f"{file} is of another version; make it again with: python -m rtc_mjx.evaluate --run {run.folder}")
+    return held
 
 
 def table(runs: Sequence[Run]) -> str:
@@ -88,7 +91,7 @@ def curves(runs: Sequence[Run], file: Path) -> None:
             if not lines:
                 continue
             updates, values = [line["update"] for line in lines], np.array([line[name] for line in lines])
-            mean, spread = values.mean(axis=1), values.std(axis=1)
+            mean, spread = values.mean(axis=1), values.std(axis=1, ddof=1) if values.shape[1] > 1 else np.zeros(len(values))
             axis.plot(updates, mean, color=f"C{index}", label=run.config.method, lw=1.4)
             axis.fill_between(updates, mean - spread, mean + spread, color=f"C{index}", alpha=0.15, lw=0)
         if name.startswith("jsd"):
@@ -134,6 +137,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     scenes = {run.config.scene.name for run in runs}
     if len(scenes) > 1:
         raise UsageError(f"runs of one scene are needed, these are of {', '.join(sorted(scenes))}")
+    methods = [run.config.method for run in runs]
+    twice = [m for m in methods if methods.count(m) > 1]
+    if twice:
+        raise UsageError(f"one run a method is needed; there are {methods.count(twice[0])} of {twice[0]}")
     records = [record(run) for run in runs]
     options.out.mkdir(parents=True, exist_ok=True)
     text = table(runs)

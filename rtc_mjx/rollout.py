@@ -66,4 +66,4 @@ def damp(state: PhysicsState, factor: float) -> PhysicsState:
     """The same values; what flows back through them is multiplied by `factor`."""
     if factor == 1.0:
         return state
-    return jax.tree.map(lambda x: factor * x + lax.stop_gradient((1 - factor) * x), state)
+    return jax.tree.map(lambda x: lax.stop_gradient(x) + factor * (x - lax.stop_gradient(x)), state)

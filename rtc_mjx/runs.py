@@ -4,10 +4,14 @@ A checkpoint is written beside and renamed when complete (orbax), with a digest 
 crash cuts short is a checkpoint without its name or a last line of metrics.jsonl: both are taken away on resuming.
 """
 
+import contextlib
+import fcntl
 import hashlib
 import json
 import logging
 import os
+import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +21,7 @@ import numpy as np
 
 from rtc_mjx import config as settings
 from rtc_mjx.config import Config
-from rtc_mjx.errors import RunError, UsageError
+from rtc_mjx.errors import RunError, UsageError, quiet_destructors
 
 KEPT = 3  # checkpoints
 
@@ -98,11 +102,15 @@ class Run:
         named = ocp.args.Composite(
             state=ocp.args.StandardSave(_named(state)), notes=ocp.args.JsonSave({"digest": _digest(state), "wall_s": wall_s})
         )
-        try:
-            with _manager(self.folder / "checkpoints") as manager:
-                manager.save(update, args=named, force=True)
-        except Exception as error:  # orbax raises many kinds; whichever it is, the run must say that nothing was lost
-            raise RunError(f"checkpoint {update} could not be written to {self.folder / 'checkpoints'}: {_first_line(error)}") from error
+        failed = None
+        with quiet_destructors():
+            try:
+                with _manager(self.folder / "checkpoints") as manager:
+                    manager.save(update, args=named, force=True)
+            except Exception as error:  # orbax raises many kinds; whichever it is, the run must say that nothing was lost
+                failed = _first_line(error)
+        if failed:
+            raise RunError(f"checkpoint {update} could not be written to {self.folder / 'checkpoints'}: {failed}")
 
     def restore(self, like: Any) -> tuple[int, Any, float]:
         """The last whole checkpoint: its update, its state in the structure and types of `like`, and the wall time until then.
@@ -112,14 +120,22 @@ class Run:
         Raises:
             UsageError: there is no whole one.
         """
+        failed = []
         for update in self.checkpoints():
-            try:
-                state, notes = self._read(update, like)
-            except Exception as error:  # orbax and tensorstore raise bare Exceptions for damaged files
-                logging.getLogger("rtc_mjx").warning("checkpoint %d cannot be read, using the one before: %s", update, _first_line(error))
-                continue
+            with quiet_destructors():
+                try:
+                    state, notes = self._read(update, like)
+                except MemoryError:
+                    raise
+                except Exception as error:  # orbax and tensorstore raise bare Exceptions for damaged files
+                    failed.append(f"checkpoint {update} cannot be read ({_first_line(error)})")
+                    continue
+            for reason in failed:
+                logging.getLogger("rtc_mjx").warning("%s, using that of update %d", reason, update)
             return update, state, float(notes["wall_s"])
-        raise UsageError(f"{self.folder} has no whole checkpoint; start the run again in a new directory")
+        if failed:
+            raise UsageError(f"{self.folder} has no whole checkpoint: {'; '.join(failed)}")
+        raise UsageError(f"{self.folder} has no whole checkpoint yet; --resume goes on with the training")
 
     def checkpoints(self) -> Iterator[int]:
         """Updates at which checkpoints stand, newest first."""
@@ -137,11 +153,30 @@ class Run:
             raise ValueError("its numbers are not those that were written")
         return state, found.notes
 
-    def discard_after(self, update: int) -> None:
-        """Takes away checkpoints later than an update (damaged ones), so that new ones can stand there."""
-        with _manager(self.folder / "checkpoints") as manager:
-            for later in [u for u in self.checkpoints() if u > update]:
-                manager.delete(later)
+    def set_aside_after(self, update: int) -> None:
+        """Renames checkpoints later than an update (they could not be read), so that new ones can stand there."""
+        for later in [u for u in self.checkpoints() if u > update]:
+            place = self.folder / "checkpoints" / str(later)
+            place.rename(place.with_name(f"{later}.unreadable.{time.time_ns()}"))
+
+    def clear_unfinished(self) -> None:
+        """Takes away checkpoints that a crash left without a name."""
+        for part in (self.folder / "checkpoints").glob("*.orbax-checkpoint-tmp*"):
+            shutil.rmtree(part, ignore_errors=True)
+
+    @contextlib.contextmanager
+    def lock(self) -> Iterator[None]:
+        """Held while a process trains in the directory.
+
+        Raises:
+            UsageError: another process does.
+        """
+        with (self.folder / ".lock").open("w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise UsageError(f"--run {self.folder}: another process is training there") from None
+            yield
 
 
 def _orbax() -> Any:

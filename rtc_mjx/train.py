@@ -17,7 +17,8 @@ from typing import Any
 import jax
 from jax import random
 
-from rtc_mjx import cache, cli, config, dataset, evaluate
+from rtc_mjx import cache, cli, dataset, evaluate
+from rtc_mjx import config as settings
 from rtc_mjx.config import Config
 from rtc_mjx.errors import RunError
 from rtc_mjx.learner import Learner, TrainState, compiled_chunk, start
@@ -33,7 +34,15 @@ def train(config: Config) -> Run:
         RunError: a checkpoint could not be written.
         KeyboardInterrupt: interrupted; a checkpoint was saved first.
     """
+    config = settings.check(config)
     run = Run.open(config.folder) if config.resume else Run.create(config)
+    with run.lock():
+        learn(run, config)
+    return run
+
+
+def learn(run: Run, config: Config) -> None:
+    """The training loop."""
     expert = dataset.demonstrations(config.scene, config.experts.train, evaluate.TRAIN_DATA)
     learner = evaluate.learner_for(config, expert)
     state, update, before = begin(run, learner, config)
@@ -50,23 +59,24 @@ def train(config: Config) -> Run:
             check_finite(line, run)
             if update % config.every.test == 0 or update == config.updates:
                 line |= test(state)
-            report(line)
+            run.log(line)  # before the checkpoint: what a crash leaves without one is written again
             if update % config.every.save == 0 or update == config.updates or interrupted:
                 run.save(update, state, line["wall_s"])
+            report(line)
             if interrupted:
                 raise KeyboardInterrupt
-    return run
 
 
 def begin(run: Run, learner: Learner, config: Config) -> tuple[TrainState, int, float]:
     """The state to go on from, its update, and the seconds spent before."""
     make = jax.vmap(functools.partial(start, learner))
-    if not (config.resume and any(run.checkpoints())):
+    run.clear_unfinished()
+    if not (config.resume and any(True for _ in run.checkpoints())):
         run.rewind(0)
         return jax.jit(make)(evaluate.seeds_of(config)), 0, 0.0
     update, state, wall = run.restore(jax.eval_shape(make, evaluate.seeds_of(config)))
     run.rewind(update)
-    run.discard_after(update)
+    run.set_aside_after(update)
     return state, update, wall
 
 
@@ -105,7 +115,9 @@ def check_finite(line: dict[str, Any], run: Run) -> None:
         name, seed = bad[0]
         whole = next(run.checkpoints(), None)
         kept = f"the last checkpoint is of update {whole}" if whole is not None else "there is no checkpoint yet"
-        raise RunError(f"update {line['update']}: {name} of seed {seed} is not finite; {kept}; a lower learning rate may help")
+        raise RunError(
+            f"update {line['update']}: {name} of seed {seed} is not finite; {kept}; a new run with a lower learning rate may do better"
+        )
 
 
 class Interruption:
@@ -122,6 +134,7 @@ class Interruption:
             if self.noted:
                 raise KeyboardInterrupt  # a second one does not wait
             self.noted = True
+            sys.stderr.write("stopping: a checkpoint is saved first (once more to stop at once)\n")
 
         self.before = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
         return self
@@ -134,9 +147,9 @@ class Interruption:
 def main(argv: Sequence[str] | None = None) -> None:
     """Trains as the command line says, then evaluates."""
     argv = sys.argv[1:] if argv is None else argv
-    settings = config.from_command_line(argv, "python -m rtc_mjx.train")
+    config = settings.from_command_line(argv, "python -m rtc_mjx.train")
     cache.keep_compiled()
-    run = train(settings)
+    run = train(config)
     evaluate.main(["--run", str(run.folder)])
 
 
