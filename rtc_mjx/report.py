@@ -100,10 +100,12 @@ def curves(runs: Sequence[Run], file: Path) -> None:
         axis.grid(alpha=0.25)
     for axis in axes.flat[len(panels) :]:
         axis.axis("off")
-    axes[0][0].legend(frameon=False, fontsize=7)
     for axis in axes[-1]:
         axis.set_xlabel("updates")
-    canvas.tight_layout()
+    handles, labels = axes[0][0].get_legend_handles_labels()
+    canvas.tight_layout(rect=(0, 0.06, 1, 1))
+    if handles:
+        canvas.legend(handles, labels, loc="lower center", ncol=len(labels), frameon=False, fontsize=9)
     canvas.savefig(file, dpi=150)
     pyplot.close(canvas)
 
