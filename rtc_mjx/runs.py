@@ -9,7 +9,6 @@ import fcntl
 import hashlib
 import json
 import logging
-import os
 import shutil
 import time
 from collections.abc import Iterator
@@ -22,6 +21,7 @@ import numpy as np
 from rtc_mjx import config as settings
 from rtc_mjx.config import Config
 from rtc_mjx.errors import RunError, UsageError, quiet_destructors
+from rtc_mjx.files import write_whole
 
 KEPT = 3  # checkpoints
 
@@ -75,17 +75,19 @@ class Run:
         if not self.metrics_file.is_file():
             return []
         lines = self.metrics_file.read_text().split("\n")[:-1]  # after the last newline: nothing, or a line cut short
-        try:
-            return [json.loads(line) for line in lines]
-        except ValueError as error:
-            raise UsageError(f"{self.metrics_file} is damaged: {error}") from error
+        held = []
+        for number, line in enumerate(lines, 1):
+            try:
+                held.append(json.loads(line))
+                held[-1]["update"]
+            except (ValueError, KeyError, TypeError) as error:
+                raise UsageError(f"{self.metrics_file}, line {number} is damaged: {error}") from error
+        return held
 
     def rewind(self, update: int) -> None:
         """Takes away the lines after an update, and one that was cut short."""
         kept = [json.dumps(line) for line in self.metrics() if line["update"] <= update]
-        part = self.metrics_file.with_suffix(".part")
-        part.write_text("".join(line + "\n" for line in kept))
-        os.replace(part, self.metrics_file)
+        write_whole(self.metrics_file, "".join(line + "\n" for line in kept))
 
     def log(self, line: dict[str, Any]) -> None:
         """Appends a line."""

@@ -154,6 +154,12 @@ def test_metrics_cut_short_by_a_crash_lose_only_the_last_line(whole, tmp_path):
     with run.metrics_file.open("a") as file:
         file.write('{"update": 50, "wall')
     assert lines(run) == lines(whole)
+    for damage in ('{"updat": 1}', "[]", "{"):
+        held = run.metrics_file.read_text()
+        run.metrics_file.write_text(f"{damage}\n{held}")
+        with pytest.raises(UsageError, match="line 1 is damaged"):
+            run.metrics()
+        run.metrics_file.write_text(held)
     run.rewind(20)
     assert [line["update"] for line in run.metrics()] == [10, 20]
 
