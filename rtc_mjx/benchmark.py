@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -315,10 +315,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Runs the benchmark."""
     options = arguments().parse_args(argv)
     if options.first_result:
-        _names(options.first_result)
+        _chosen("world", options.first_result, WORLDS)
         sys.stdout.write(f"{_first_result(options.first_result)}\n")
         return
-    parts, names = _parts(options.parts or ",".join(PARTS[: 2 if options.quick else 3])), _names(options.worlds)
+    parts = _chosen("part", options.parts or ",".join(PARTS[: 2 if options.quick else 3]), PARTS)
+    names = _chosen("world", options.worlds, WORLDS)
     batches = [64] if options.quick else _batches(options.batches)
     if options.rounds < 1:
         raise UsageError(f"--rounds {options.rounds}: at least 1 is needed")
@@ -363,19 +364,12 @@ def _physics(console: Console, names: Sequence[str], batches: Sequence[int], rou
     return rows
 
 
-def _parts(text: str) -> list[str]:
-    parts = text.split(",")
-    unknown = [p for p in parts if p not in PARTS]
-    if unknown:
-        raise UsageError(f"--parts: no part '{unknown[0]}'; there are {', '.join(PARTS)}")
-    return parts
-
-
-def _names(text: str) -> list[str]:
+def _chosen(kind: str, text: str, known: Collection[str]) -> list[str]:
+    """The names of a comma-separated option, all of them known."""
     names = text.split(",")
-    unknown = [n for n in names if n not in WORLDS]
+    unknown = [n for n in names if n not in known]
     if unknown:
-        raise UsageError(f"--worlds: no world '{unknown[0]}'; there are {', '.join(WORLDS)}")
+        raise UsageError(f"--{kind}s: no {kind} '{unknown[0]}'; there are {', '.join(known)}")
     return names
 
 

@@ -9,7 +9,6 @@ import contextlib
 import dataclasses
 import io
 import json
-import os
 import tomllib
 import types
 import typing
@@ -22,6 +21,7 @@ from typing import Any
 import tyro
 
 from rtc_mjx.errors import UsageError
+from rtc_mjx.files import write_whole
 from rtc_mjx.learner import OptimiserOptions
 from rtc_mjx.losses import LossWeights
 from rtc_mjx.methods import METHODS, method_name
@@ -324,9 +324,7 @@ def flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def write(config: Config, folder: Path) -> None:
     """Writes config.json."""
-    part = folder / ".config.json.part"
-    part.write_text(json.dumps(to_dict(config), indent=1) + "\n")
-    os.replace(part, folder / "config.json")
+    write_whole(folder / "config.json", json.dumps(to_dict(config), indent=1) + "\n")
 
 
 def read(folder: Path) -> Config:

@@ -14,7 +14,7 @@ from dm_control import mujoco as dm_mujoco
 from dm_env import specs
 
 from rtc_mjx.errors import NonFiniteError, UsageError
-from rtc_mjx.physics import PhysicsState, control_step, specialised_step
+from rtc_mjx.physics import PhysicsState, control_step, place_surroundings, specialised_step
 from rtc_mjx.scenes import Scene
 from rtc_mjx.trajectory import Episode
 
@@ -90,12 +90,10 @@ class Environment(dm_env.Environment):
     def _enter(self, episode: Episode, time: int, state: PhysicsState) -> tuple[np.ndarray, float]:
         """Makes a state the current one, dm_control's physics included; returns its observation and reward."""
         self._now = (episode, time, state)
-        x, y, heading = np.asarray(episode.surroundings.pose[time]).T
         data = self._physics.data
         with self._physics.reset_context():
             data.qpos[:], data.qvel[:] = np.asarray(state.qpos), np.asarray(state.qvel)
-            data.mocap_pos[:, 0], data.mocap_pos[:, 1] = x, y
-            data.mocap_quat[:] = np.stack([np.cos(heading / 2), 0 * x, 0 * x, np.sin(heading / 2)], axis=1)
+            place_surroundings(data, np.asarray(episode.surroundings.pose[time]))
             data.time = time * self.control_timestep()
         observation, reward = self._look(episode, time, state)
         return np.asarray(observation, np.float32), float(reward)

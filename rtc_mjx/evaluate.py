@@ -8,7 +8,6 @@ expert, and expert against expert at the same size, stand beside them: the ceili
 import argparse
 import functools
 import json
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,8 @@ from rtc_mjx import cache, cli, dataset, metrics
 from rtc_mjx.agent_types import SOURCES
 from rtc_mjx.config import Config
 from rtc_mjx.errors import RunError, UsageError
-from rtc_mjx.learner import Learner, start
+from rtc_mjx.files import write_whole
+from rtc_mjx.learner import Learner, TrainState, start
 from rtc_mjx.methods import METHODS, Method
 from rtc_mjx.models import Networks
 from rtc_mjx.runs import Run
@@ -59,6 +59,16 @@ def seeds_of(config: Config) -> Array:
     return config.first_seed + jnp.arange(config.seeds)
 
 
+def start_all(learner: Learner, config: Config) -> TrainState:
+    """The states of all seeds before the first update."""
+    return jax.jit(jax.vmap(functools.partial(start, learner)))(seeds_of(config))
+
+
+def start_shapes(learner: Learner, config: Config) -> TrainState:
+    """Their shapes and types: what a checkpoint is restored into."""
+    return jax.eval_shape(functools.partial(start_all, learner, config))
+
+
 def type_sources(method: Method) -> tuple[str, ...]:
     """Where test types may come from: the prior, and, where there is an encoder, demonstrations."""
     return ("prior", "paired", "shuffled") if method.encodes else ("prior",)
@@ -80,8 +90,7 @@ def roller(learner: Learner) -> Roll:
             "paired": lambda: inferred(mine, draw),
             "shuffled": lambda: inferred(other, draw),
         }
-        nudge = jnp.zeros((learner.scene.steps, agent.outputs))
-        tracks = {name: learner.play(agent, mine.episode, ways[name]().agent_type, noise, nudge) for name in sources}
+        tracks = {name: learner.play(agent, mine.episode, ways[name]().agent_type, noise) for name in sources}
         return {name: learner.scene.features(mine.episode, track) | {FINITE: _finite(track)} for name, track in tracks.items()}
 
     def all_episodes(networks: Networks, test: Demonstration, key: Array) -> dict[str, dict[str, Array]]:
@@ -128,11 +137,11 @@ def evaluate(run: Run, episodes: int) -> dict[str, Any]:
     train = dataset.demonstrations(config.scene, config.experts.train, TRAIN_DATA)
     tests = [dataset.demonstrations(config.scene, episodes, seed) for seed in (TEST_DATA, SECOND_TEST_DATA)]
     learner = learner_for(config, train)
-    update, state, _ = run.restore(jax.eval_shape(jax.vmap(functools.partial(start, learner)), seeds_of(config)))
+    update, state, _ = run.restore(start_shapes(learner, config))
     features = jax.device_get(roller(learner)(state.networks, without_truth(tests[0]), random.key(NOISE)))
     expert, second = (expert_features(config, test) for test in tests)
     table = score(config, features, expert)
-    means = {source: {name: _summary(config, source, name, features, expert, table) for name in table[source]} for source in table}
+    means = {source: _summaries(config, features[source], expert, table[source]) for source in table}
     return {
         "scene": config.scene.name,
         "method": config.method,
@@ -145,21 +154,20 @@ def evaluate(run: Run, episodes: int) -> dict[str, Any]:
     }
 
 
-def _summary(
-    config: Config, source: str, name: str, features: dict[str, Features], expert: Features, table: dict[str, dict[str, list[float]]]
-) -> dict[str, Any]:
-    """Per seed, mean, standard deviation, and a bootstrap interval of the mean over test episodes."""
-    values = table[source][name]
+def _summaries(config: Config, features: Features, expert: Features, values: dict[str, list[float]]) -> dict[str, dict[str, Any]]:
+    """Of each metric: per seed, mean, standard deviation, and a bootstrap interval of the mean over test episodes."""
 
-    def mean_over_seeds(rows: np.ndarray) -> float:
+    def means_over_seeds(rows: np.ndarray) -> np.ndarray:
         reference = {k: v[rows] for k, v in expert.items()}
-        drawn = [{k: v[i][rows] for k, v in features[source].items()} for i in range(config.seeds)]
-        return float(np.mean([config.scene.metrics(d, reference)[name] for d in drawn]))
+        drawn = [{k: v[i][rows] for k, v in features.items()} for i in range(config.seeds)]
+        return np.mean([list(config.scene.metrics(d, reference).values()) for d in drawn], axis=0)
 
-    count = len(next(iter(expert.values())))
-    low, high = metrics.bootstrap(np.arange(count), mean_over_seeds, draws=200)
-    spread = float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
-    return {"per_seed": values, "mean": float(np.mean(values)), "std": spread, "interval": [low, high]}
+    low, high = metrics.bootstrap(np.arange(len(next(iter(expert.values())))), means_over_seeds, draws=200)
+    out = {}
+    for (name, per_seed), *interval in zip(values.items(), low, high, strict=True):
+        spread = float(np.std(per_seed, ddof=1)) if len(per_seed) > 1 else 0.0
+        out[name] = {"per_seed": per_seed, "mean": float(np.mean(per_seed)), "std": spread, "interval": [float(x) for x in interval]}
+    return out
 
 
 def table(result: dict[str, Any]) -> Table:
@@ -190,9 +198,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     run = Run.open(options.run)
     result = evaluate(run, options.episodes or run.config.experts.test)
     Console(width=None if Console().is_terminal else 140).print(table(result))
-    part = run.folder / ".evaluation.json.part"
-    part.write_text(json.dumps(result, indent=1) + "\n")
-    os.replace(part, run.folder / "evaluation.json")
+    write_whole(run.folder / "evaluation.json", json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":

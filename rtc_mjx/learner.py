@@ -103,7 +103,7 @@ class Learner:
         rows = self.rows(branch)
         return jax.tree.map(lambda x: x[rows], batch)
 
-    def play(self, agent: Agent, episode: Episode, agent_type: Array, key: Array, nudge: Array) -> Trajectory:
+    def play(self, agent: Agent, episode: Episode, agent_type: Array, key: Array, nudge: Array | None = None) -> Trajectory:
         """One rollout of the policy under one type, with `nudge` (T, outputs) added to its outputs to differentiate by."""
         options, actor = self.optimiser, agent.actor(agent_type, key, nudge)
         return rollout(self.scene, actor, episode, gradient=options.gradient, decay=options.decay, one_step=self.one_step)

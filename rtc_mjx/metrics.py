@@ -1,6 +1,7 @@
 """Distances between populations and their uncertainty: plain numpy, so that every number can be checked by hand."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -28,13 +29,14 @@ def _relative_entropy(p: np.ndarray, q: np.ndarray) -> float:
     return float(np.sum(p[held] * np.log2(p[held] / q[held])))
 
 
-def bootstrap(values: np.ndarray, statistic: Callable[[np.ndarray], float] = np.mean, *, draws: int = 1000) -> tuple[float, float]:
-    """The 95 % percentile interval of a statistic over resampled rows of `values`; the draws are always the same.
+def bootstrap(values: np.ndarray, statistic: Callable[[np.ndarray], Any] = np.mean, *, draws: int = 1000) -> tuple[Any, Any]:
+    """The 95 % percentile interval of a statistic (a number, or an array of them) over resampled rows of `values`.
 
-    It is widened to hold the statistic itself where need be: resampling biases a divergence upwards.
+    The draws are always the same. The interval is widened to hold the statistic itself where need be: resampling biases a
+    divergence upwards.
     """
     random = np.random.default_rng(0)
     resampled = [statistic(values[random.integers(0, len(values), len(values))]) for _ in range(draws)]
-    low, high = np.percentile(resampled, [2.5, 97.5])
+    low, high = np.percentile(resampled, [2.5, 97.5], axis=0)
     whole = statistic(values)
-    return float(min(low, whole)), float(max(high, whole))
+    return np.minimum(low, whole), np.maximum(high, whole)

@@ -100,10 +100,10 @@ class Networks:
 class Statistics:
     """Mean and standard deviation of the expert's observations and actions; every network sees standardised inputs."""
 
-    observation_mean: Float[Array, "*seeds features"]
-    observation_scale: Float[Array, "*seeds features"]
-    action_mean: Float[Array, "*seeds controls"]
-    action_scale: Float[Array, "*seeds controls"]
+    observation_mean: Float[Array, "features"]
+    observation_scale: Float[Array, "features"]
+    action_mean: Float[Array, "controls"]
+    action_scale: Float[Array, "controls"]
 
 
 @dataclass(frozen=True)
@@ -127,11 +127,12 @@ class Agent:
     @property
     def outputs(self) -> int:
         """How many numbers the policy puts out."""
-        return policy_outputs(self.options, len(self.scene.world.control_ids))
+        return output_count(self.options, len(self.scene.world.control_ids))
 
-    def actor(self, agent_type: Array, key: Array, nudge: Array) -> Actor:
+    def actor(self, agent_type: Array, key: Array, nudge: Array | None = None) -> Actor:
         """The policy under one type, with the noise of T actions; `nudge` (T, outputs) is added to its outputs."""
         draw = self.action_distribution(jnp.zeros(self.outputs)).noise
+        nudge = jnp.zeros((self.scene.steps, self.outputs)) if nudge is None else nudge
 
         def act(memory: tuple[()], observation: Array, given: tuple[Any, Array]) -> tuple[tuple[()], Array]:
             noise, push = given
@@ -179,7 +180,7 @@ class Agent:
         return (action - self.statistics.action_mean) / self.statistics.action_scale
 
 
-def policy_outputs(options: ModelOptions, controls: int) -> int:
+def output_count(options: ModelOptions, controls: int) -> int:
     """Numbers that parametrise a mixture over controls: weights, means, raw scales."""
     return options.mixture * (1 + 2 * controls)
 
@@ -190,7 +191,7 @@ def make_networks(key: Array, scene: Scene, features: int, space: TypeSpace, opt
     hidden = [options.width] * options.depth
     pair = features + controls
     builders: dict[str, Callable[[], Any]] = {
-        "policy": lambda: MLP([features + space.size, *hidden, policy_outputs(options, controls)], rngs),
+        "policy": lambda: MLP([features + space.size, *hidden, output_count(options, controls)], rngs),
         "encoder": lambda: Encoder(pair, space.posterior_outputs, options.width, options.depth, rngs),
         "prior": lambda: jax.random.normal(rngs(), (space.prior_outputs,)),
         "discriminator": lambda: MLP([pair, *[options.discriminator_width] * options.depth, 1], rngs),

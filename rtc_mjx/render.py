@@ -6,7 +6,6 @@
 """
 
 import argparse
-import functools
 import logging
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
@@ -14,7 +13,6 @@ from pathlib import Path
 
 import av
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import random
@@ -26,8 +24,7 @@ from rtc_mjx import cache, cli, dataset, evaluate
 from rtc_mjx.agent_types import SOURCES
 from rtc_mjx.camera import Picture, camera
 from rtc_mjx.errors import UsageError
-from rtc_mjx.learner import start
-from rtc_mjx.physics import World
+from rtc_mjx.physics import World, place_surroundings
 from rtc_mjx.runs import Run
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
@@ -44,13 +41,13 @@ def rollouts(run: Run, episodes: int, types: int, seed_index: int) -> tuple[Demo
     learner = evaluate.learner_for(config, dataset.demonstrations(config.scene, config.experts.train, evaluate.TRAIN_DATA))
     test = dataset.demonstrations(config.scene, config.experts.test, evaluate.TEST_DATA)
     shown = jax.tree.map(lambda x: x[:episodes], test)
-    _, state, _ = run.restore(jax.eval_shape(jax.vmap(functools.partial(start, learner)), evaluate.seeds_of(config)))
+    _, state, _ = run.restore(evaluate.start_shapes(learner, config))
     agent = learner.agent(jax.tree.map(lambda x: x[seed_index], state.networks))
 
     def play(demonstration: Demonstration, key: jax.Array) -> Trajectory:
         draw, noise = random.split(key)
         g = SOURCES[learner.method.test_types](agent, demonstration, draw).agent_type
-        return learner.play(agent, demonstration.episode, g, noise, jnp.zeros((config.scene.steps, agent.outputs)))
+        return learner.play(agent, demonstration.episode, g, noise)
 
     keys = random.split(random.key(evaluate.NOISE), (min(episodes, config.experts.test), types))
     inner = jax.vmap(play, in_axes=(None, 0))
@@ -115,10 +112,9 @@ def _place(
     time: int, marks: int,
 ) -> None:  # fmt: skip
     """Puts everything where it is at a time."""
-    data.qpos[:], users = qpos, len(around)
-    data.mocap_pos[:users, :2] = around[:, :2]
-    data.mocap_quat[:users] = np.stack([np.cos(around[:, 2] / 2), 0 * around[:, 2], 0 * around[:, 2], np.sin(around[:, 2] / 2)], axis=1)
-    index = users
+    data.qpos[:] = qpos
+    place_surroundings(data, around)
+    index = len(around)
     for actor, (places, turns) in enumerate(paths):
         if actor:
             data.mocap_pos[index], data.mocap_quat[index] = places[time], turns[time]

@@ -21,7 +21,7 @@ from rtc_mjx import cache, cli, dataset, evaluate
 from rtc_mjx import config as settings
 from rtc_mjx.config import Config
 from rtc_mjx.errors import RunError
-from rtc_mjx.learner import Learner, TrainState, compiled_chunk, start
+from rtc_mjx.learner import Learner, TrainState, compiled_chunk
 from rtc_mjx.progress import Reporter
 from rtc_mjx.runs import Run
 
@@ -69,12 +69,11 @@ def learn(run: Run, config: Config) -> None:
 
 def begin(run: Run, learner: Learner, config: Config) -> tuple[TrainState, int, float]:
     """The state to go on from, its update, and the seconds spent before."""
-    make = jax.vmap(functools.partial(start, learner))
     run.clear_unfinished()
     if not (config.resume and any(True for _ in run.checkpoints())):
         run.rewind(0)
-        return jax.jit(make)(evaluate.seeds_of(config)), 0, 0.0
-    update, state, wall = run.restore(jax.eval_shape(make, evaluate.seeds_of(config)))
+        return evaluate.start_all(learner, config), 0, 0.0
+    update, state, wall = run.restore(evaluate.start_shapes(learner, config))
     run.rewind(update)
     run.set_aside_after(update)
     return state, update, wall

@@ -12,10 +12,10 @@ from rtc_mjx.physics.step import (
     rest_surroundings,
     step,
 )
-from rtc_mjx.physics.world import World, asset_names, assets, from_spec, load
+from rtc_mjx.physics.world import World, asset_names, assets, from_spec, load, place_surroundings
 
 __all__ = [
     "SOLUTION", "OneStep", "PhysicsState", "Surroundings", "World", "asset_names", "assets", "check_inputs", "constraint_rows",
-    "contact_problem", "control_step", "from_spec", "load", "rest_state", "rest_surroundings", "simulate",
+    "contact_problem", "control_step", "from_spec", "load", "place_surroundings", "rest_state", "rest_surroundings", "simulate",
     "specialised_step", "step",
 ]  # fmt: skip

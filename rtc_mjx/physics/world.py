@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import jax
 import mujoco
@@ -131,6 +132,14 @@ class World:
         if name not in self.control_names:
             raise UsageError(f"world '{self.name}' has no control '{name}'; it has {', '.join(self.control_names)}")
         return self.control_names.index(name)
+
+
+def place_surroundings(data: Any, pose: Float[np.ndarray, "users 3"]) -> None:
+    """Puts the first mocap bodies of C MuJoCo's data at x in m, y in m, heading in rad, as the step does on the device."""
+    x, y, heading = pose.T
+    users = len(pose)
+    data.mocap_pos[:users, 0], data.mocap_pos[:users, 1] = x, y
+    data.mocap_quat[:users] = np.stack([np.cos(heading / 2), 0 * x, 0 * x, np.sin(heading / 2)], axis=1)
 
 
 @functools.lru_cache(maxsize=32)
