@@ -7,7 +7,6 @@ positions with respect to all controls. An update is one of training: sampling, 
 
 import argparse
 import dataclasses
-import functools
 import json
 import os
 import subprocess
@@ -29,9 +28,9 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from rtc_mjx import cache, cli, config, dataset, evaluate, pile_up
+from rtc_mjx import cache, cli, config, dataset, pile_up
 from rtc_mjx.errors import UsageError
-from rtc_mjx.learner import compiled_chunk, start
+from rtc_mjx.learner import compiled_chunk, start_all
 from rtc_mjx.physics import PhysicsState, Surroundings, World, load, rest_state, rest_surroundings, simulate, specialised_step
 
 WORLDS: dict[str, Callable[[], World]] = {
@@ -190,8 +189,8 @@ def _seconds(function: Callable[..., Array], inputs: Inputs, calls: int) -> floa
 def updates(method: str, rounds: int, seed_counts: Sequence[int] = (1, 8)) -> list[dict[str, object]]:
     """Milliseconds an update of a method on the double goal takes, on MJX and on a hand-written point mass, for numbers of seeds."""
     settings = config.defaults("double_goal", method)
-    expert = dataset.demonstrations(settings.scene, 1024, evaluate.TRAIN_DATA)
-    learner, data = evaluate.learner_for(settings, expert), evaluate.without_truth(expert)
+    expert = dataset.demonstrations(settings.scene, 1024, dataset.TRAIN)
+    learner, data = settings.learner(dataset.statistics(expert)), dataset.without_truth(expert)
     timestep = settings.scene.world.timestep
 
     def by_hand(state: PhysicsState, force: Array, around: Surroundings) -> PhysicsState:
@@ -201,7 +200,7 @@ def updates(method: str, rounds: int, seed_counts: Sequence[int] = (1, 8)) -> li
     running = {}
     for physics, count in ((p, n) for p in ("mjx", "handwritten") for n in seed_counts):
         chosen = dataclasses.replace(learner, one_step=by_hand if physics == "handwritten" else None)
-        state = jax.vmap(functools.partial(start, chosen))(jnp.arange(count))
+        state = start_all(chosen, range(count))
         program = compiled_chunk(chosen, UPDATES).lower(state, data).compile()
         running[physics, count] = (program, program(state, data)[0])
     times: dict[tuple[str, int], list[float]] = {key: [] for key in running}

@@ -22,10 +22,10 @@ import tyro
 
 from rtc_mjx.errors import UsageError
 from rtc_mjx.files import write_whole
-from rtc_mjx.learner import OptimiserOptions
+from rtc_mjx.learner import Learner, OptimiserOptions
 from rtc_mjx.losses import LossWeights
 from rtc_mjx.methods import METHODS, method_name
-from rtc_mjx.models import ModelOptions
+from rtc_mjx.models import ModelOptions, Statistics
 from rtc_mjx.scenes import DoubleGoal, Scene, scene_type
 
 
@@ -97,6 +97,27 @@ class Config:
     def folder(self) -> Path:
         """The run directory."""
         return self.run or Path("runs") / self.scene.name / self.method
+
+    @property
+    def all_seeds(self) -> range:
+        """The seeds that are trained."""
+        return range(self.first_seed, self.first_seed + self.seeds)
+
+    def learner(self, statistics: Statistics) -> Learner:
+        """What these settings train, given the statistics of its demonstrations."""
+        method = METHODS[self.method]
+        return Learner(
+            scene=self.scene,
+            method=method,
+            space=method.space(self.model, self.scene.labels),
+            statistics=statistics,
+            model=self.model,
+            weights=self.losses,
+            optimiser=self.optimiser,
+            updates=self.updates,
+            batch=self.batch,
+            encoder_share=self.encoder_share,
+        )
 
 
 LEAST = {
@@ -338,8 +359,12 @@ def read(folder: Path) -> Config:
         raise UsageError(f"{folder} is not a run directory: it has no config.json")
     try:
         table = json.loads(file.read_text())
-        scene = table.pop("scene")
+        scene = dict(table["scene"])
         config = Config(scene=merge(scene_type(scene.pop("name"))(), scene, f"{file} [scene]"))
+        config = merge(config, {**table, "scene": {}}, str(file))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise error if isinstance(error, UsageError) else UsageError(f"{file} is damaged: {error}") from error
-    return check(dataclasses.replace(merge(config, table, str(file)), run=folder))
+    absent = [name for name in flat(to_dict(config)) if name not in flat(table)]
+    if absent:  # today's default would not be what the run was made with
+        raise UsageError(f"{file} lacks {', '.join(absent)}: it is damaged or of another version of rtc_mjx")
+    return check(dataclasses.replace(config, run=folder))

@@ -16,11 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from rtc_mjx import cache
+from rtc_mjx.keys import stream
 from rtc_mjx.models import Statistics
 from rtc_mjx.rollout import rollout
 from rtc_mjx.scenes import Scene
 from rtc_mjx.trajectory import Demonstration
 
+TRAIN, TEST, SECOND_TEST = 0, 1, 2  # seeds of the independent sets: to learn from, to compare with, to compare these with
 CHUNK = 1024  # episodes simulated at once
 
 
@@ -41,11 +43,11 @@ def demonstrations(scene: Scene, count: int, seed: int) -> Demonstration:
         seed: demonstrations of different seeds are independent.
     """
     make = jax.jit(jax.vmap(lambda key: demonstrate(scene, key)))
-    shapes = jax.eval_shape(make, jax.random.split(jax.random.key(seed), count))
+    shapes = jax.eval_shape(make, jax.random.split(stream("demonstrations", seed), count))
     file = cache.folder() / "demonstrations" / f"{scene.name}-{fingerprint(scene, count, seed)}.npz"
     leaves = _read(file, jax.tree.leaves(shapes))
     if leaves is None:
-        keys = jax.random.split(jax.random.key(seed), count)
+        keys = jax.random.split(stream("demonstrations", seed), count)
         parts = [jax.device_get(make(keys[i : i + CHUNK])) for i in range(0, count, CHUNK)]
         leaves = jax.tree.leaves(jax.tree.map(lambda *x: np.concatenate(x), *parts))
         _write(file, leaves)
@@ -55,7 +57,7 @@ def demonstrations(scene: Scene, count: int, seed: int) -> Demonstration:
 def fingerprint(scene: Scene, count: int, seed: int) -> str:
     """Hash of what determines a set of demonstrations: settings, code, compiled world, versions, precision, count, seed."""
     here = Path(__file__).parent
-    code = [Path(inspect.getfile(type(scene))), *(here / name for name in ("dataset.py", "rollout.py", "scenes/base.py"))]
+    code = [Path(inspect.getfile(type(scene))), *(here / name for name in ("dataset.py", "keys.py", "rollout.py", "scenes/base.py"))]
     code += [*sorted((here / "physics").glob("*.py")), *sorted((here / "specialise").glob("*.py"))]
     made_by = {
         "settings": dataclasses.asdict(scene),
@@ -78,6 +80,12 @@ def statistics(expert: Demonstration) -> Statistics:
         return jnp.asarray(flat.mean(axis=0), jnp.float32), jnp.asarray(np.where(scale > 1e-6, scale, 1.0), jnp.float32)
 
     return Statistics(*moments(expert.trajectory.observations), *moments(expert.trajectory.actions))
+
+
+def without_truth(demonstrations: Demonstration) -> Demonstration:
+    """On the device, without what only an analysis may see."""
+    episode, trajectory = jax.tree.map(jnp.asarray, (demonstrations.episode, demonstrations.trajectory))
+    return Demonstration(episode, trajectory, ())
 
 
 def _read(file: Path, shapes: list[jax.ShapeDtypeStruct]) -> list[np.ndarray] | None:

@@ -14,6 +14,7 @@ from dm_control import mujoco as dm_mujoco
 from dm_env import specs
 
 from rtc_mjx.errors import NonFiniteError, UsageError
+from rtc_mjx.keys import stream
 from rtc_mjx.physics import PhysicsState, control_step, place_surroundings, specialised_step
 from rtc_mjx.scenes import Scene
 from rtc_mjx.trajectory import Episode
@@ -49,7 +50,7 @@ class Environment(dm_env.Environment):
 
     def reset(self) -> dm_env.TimeStep:
         """Begins the next episode."""
-        key = jax.random.fold_in(jax.random.key(self._seed), self._count)
+        key = jax.random.fold_in(stream("environment", self._seed), self._count)
         self._count += 1
         episode = self._reset(key)
         return dm_env.restart(self._enter(episode, 0, episode.start)[0])

@@ -25,48 +25,15 @@ from rtc_mjx.agent_types import SOURCES
 from rtc_mjx.config import Config
 from rtc_mjx.errors import RunError, UsageError
 from rtc_mjx.files import write_whole
-from rtc_mjx.learner import Learner, TrainState, start
-from rtc_mjx.methods import METHODS, Method
+from rtc_mjx.keys import stream
+from rtc_mjx.learner import Learner, start_shapes
+from rtc_mjx.methods import Method
 from rtc_mjx.models import Networks
 from rtc_mjx.runs import Run
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
-TRAIN_DATA, TEST_DATA, SECOND_TEST_DATA = 0, 1, 2  # seeds of demonstrations: independent sets
-NOISE = 7  # seed of the rollouts' noise
 FINITE = "finite"  # the feature that says whether a rollout is
 Features = dict[str, np.ndarray]
-
-
-def learner_for(config: Config, expert: Demonstration) -> Learner:
-    """The learner of a run's settings; `expert` are its training demonstrations."""
-    method = METHODS[config.method]
-    return Learner(
-        scene=config.scene,
-        method=method,
-        space=method.space(config.model, config.scene.labels),
-        statistics=dataset.statistics(expert),
-        model=config.model,
-        weights=config.losses,
-        optimiser=config.optimiser,
-        updates=config.updates,
-        batch=config.batch,
-        encoder_share=config.encoder_share,
-    )
-
-
-def seeds_of(config: Config) -> Array:
-    """The seeds that a run trains."""
-    return config.first_seed + jnp.arange(config.seeds)
-
-
-def start_all(learner: Learner, config: Config) -> TrainState:
-    """The states of all seeds before the first update."""
-    return jax.jit(jax.vmap(functools.partial(start, learner)))(seeds_of(config))
-
-
-def start_shapes(learner: Learner, config: Config) -> TrainState:
-    """Their shapes and types: what a checkpoint is restored into."""
-    return jax.eval_shape(functools.partial(start_all, learner, config))
 
 
 def type_sources(method: Method) -> tuple[str, ...]:
@@ -125,20 +92,14 @@ def score(config: Config, features: dict[str, Features], expert: Features) -> di
     return out
 
 
-def without_truth(demonstrations: Demonstration) -> Demonstration:
-    """On the device, without what only an analysis may see."""
-    episode, trajectory = jax.tree.map(jnp.asarray, (demonstrations.episode, demonstrations.trajectory))
-    return Demonstration(episode, trajectory, ())
-
-
 def evaluate(run: Run, episodes: int) -> dict[str, Any]:
     """All of evaluation.json for a run's last whole checkpoint."""
     config = run.config
-    train = dataset.demonstrations(config.scene, config.experts.train, TRAIN_DATA)
-    tests = [dataset.demonstrations(config.scene, episodes, seed) for seed in (TEST_DATA, SECOND_TEST_DATA)]
-    learner = learner_for(config, train)
-    update, state, _ = run.restore(start_shapes(learner, config))
-    features = jax.device_get(roller(learner)(state.networks, without_truth(tests[0]), random.key(NOISE)))
+    train = dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN)
+    tests = [dataset.demonstrations(config.scene, episodes, seed) for seed in (dataset.TEST, dataset.SECOND_TEST)]
+    learner = config.learner(dataset.statistics(train))
+    update, state, _ = run.restore(start_shapes(learner, config.all_seeds))
+    features = jax.device_get(roller(learner)(state.networks, dataset.without_truth(tests[0]), stream("evaluation", 0)))
     expert, second = (expert_features(config, test) for test in tests)
     table = score(config, features, expert)
     means = {source: _summaries(config, features[source], expert, table[source]) for source in table}

@@ -11,7 +11,7 @@ a fraction of the cost, and each trajectory's share can be inspected before it c
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +23,7 @@ from jax import lax, random
 from jaxtyping import Array, Float, Int
 
 from rtc_mjx.agent_types import SOURCES, Typed, TypeSpace
+from rtc_mjx.keys import stream
 from rtc_mjx.losses import CLOSED_LOOP, LOSSES, Case, LossWeights, gradient_penalty
 from rtc_mjx.methods import Branch, Method
 from rtc_mjx.models import Agent, ModelOptions, Networks, Statistics, make_networks
@@ -44,7 +45,7 @@ class OptimiserOptions:
         discriminator_steps: of each trajectory, at random times, that the discriminator learns from in an update; 0 for all.
         final_rate: share of the learning rate left at the last update.
         clip: largest norm of an update's gradient: of policy and encoder, of the prior, of discriminator and Q.
-        trajectory_clip: largest norm of one trajectory's gradient by the policy's outputs, in units of the minibatch's mean loss.
+        trajectory_clip: largest norm of the gradient of one trajectory's own loss by the policy's outputs.
         gradient: what flows back from step to step of a rollout.
         decay: shrinks the backward signal at each step back in time.
     """
@@ -129,8 +130,18 @@ class TrainState:
 def start(learner: Learner, seed: Array) -> TrainState:
     """The state before the first update."""
     features = learner.statistics.observation_mean.shape[-1]
-    networks = make_networks(random.key(seed), learner.scene, features, learner.space, learner.model, learner.method.parts)
+    networks = make_networks(stream("networks", seed), learner.scene, features, learner.space, learner.model, learner.method.parts)
     return TrainState(networks, transformation(learner).init(networks), seed, jnp.zeros((), int))
+
+
+def start_all(learner: Learner, seeds: Sequence[int]) -> TrainState:
+    """The states of all seeds before the first update, along a leading axis."""
+    return jax.jit(jax.vmap(functools.partial(start, learner)))(jnp.asarray(seeds))
+
+
+def start_shapes(learner: Learner, seeds: Sequence[int]) -> TrainState:
+    """Their shapes and types: what a checkpoint is restored into."""
+    return jax.eval_shape(functools.partial(start_all, learner, seeds))
 
 
 def transformation(learner: Learner) -> optax.GradientTransformation:
@@ -153,7 +164,7 @@ def transformation(learner: Learner) -> optax.GradientTransformation:
 
 def train_step(learner: Learner, state: TrainState, expert: Demonstration) -> tuple[TrainState, dict[str, Array]]:
     """One update of one seed; `expert` holds all demonstrations. Returns the next state and what to log."""
-    draw, key = random.split(random.fold_in(random.key(state.seed), state.update))
+    draw, key = random.split(random.fold_in(stream("updates", state.seed), state.update))
     rows = random.randint(draw, (learner.batch,), 0, jax.tree.leaves(expert)[0].shape[0])
     batch = jax.tree.map(lambda x: x[rows], expert)
     gradient, report = gradients(learner, state.networks, batch, key, state.update)
@@ -196,7 +207,9 @@ def gradients(learner: Learner, networks: Networks, batch: Demonstration, key: A
             lost = branch_losses(learner, held, batch, now, Played(tracks, alive), extra, CLOSED_LOOP)
             return learner.weights.total(lost, update)
 
-        cotangents, guarded = guard(pull(jax.grad(by_rollouts)(played.tracks)), alive, learner.optimiser.trajectory_clip)
+        cotangents, guarded = guard(
+            pull(jax.grad(by_rollouts)(played.tracks)), alive, branch_sizes(learner), learner.optimiser.trajectory_clip
+        )
 
     def total(networks: Networks) -> tuple[Array, dict[str, Array]]:
         agent = learner.agent(networks)
@@ -302,9 +315,20 @@ def critic_loss(learner: Learner, agent: Agent, batch: Demonstration, played: Pl
     return entropy + learner.weights.discriminator_penalty * penalty, report
 
 
-def guard(gradient: Array, alive: Array, largest: float) -> tuple[Array, dict[str, Array]]:
-    """Clips each trajectory's gradient to norm `largest` / rows; one that is not finite is dropped and counted."""
-    norms = jnp.sqrt(jnp.sum(gradient**2, axis=(1, 2))) * len(gradient)
+def branch_sizes(learner: Learner) -> Int[np.ndarray, "rows"]:
+    """For each rollout of an update, the number of rollouts that its branch's means are over."""
+    sizes = [rows.stop - rows.start for rows in (learner.rows(b) for b in learner.method.branches if b.closed_loop)]
+    return np.repeat(sizes, sizes)
+
+
+def guard(
+    gradient: Float[Array, "rows steps outputs"], alive: Array, sizes: Int[np.ndarray, "rows"], largest: float
+) -> tuple[Array, dict[str, Array]]:
+    """Clips each trajectory's gradient to `largest`; one that is not finite is dropped and counted.
+
+    A loss is a mean over the `sizes` rollouts of a branch: times that number, a trajectory's gradient is that of its own loss.
+    """
+    norms = jnp.sqrt(jnp.sum(gradient**2, axis=(1, 2))) * sizes
     good = alive & jnp.isfinite(norms)
     safe = jnp.where(good, norms, 0.0)
     factor = jnp.minimum(1.0, largest / jnp.maximum(safe, 1e-12))

@@ -20,10 +20,12 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.progress import Progress
 
-from rtc_mjx import cache, cli, dataset, evaluate
+from rtc_mjx import cache, cli, dataset
 from rtc_mjx.agent_types import SOURCES
 from rtc_mjx.camera import Picture, camera
 from rtc_mjx.errors import UsageError
+from rtc_mjx.keys import stream
+from rtc_mjx.learner import start_shapes
 from rtc_mjx.physics import World, place_surroundings
 from rtc_mjx.runs import Run
 from rtc_mjx.trajectory import Demonstration, Trajectory
@@ -38,10 +40,10 @@ HOLD = 10  # frames for which the end of an episode stays
 def rollouts(run: Run, episodes: int, types: int, seed_index: int) -> tuple[Demonstration, Trajectory]:
     """Test demonstrations, and rollouts of the run's last checkpoint in each under `types` draws of its test types."""
     config = run.config
-    learner = evaluate.learner_for(config, dataset.demonstrations(config.scene, config.experts.train, evaluate.TRAIN_DATA))
-    test = dataset.demonstrations(config.scene, config.experts.test, evaluate.TEST_DATA)
+    learner = config.learner(dataset.statistics(dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN)))
+    test = dataset.demonstrations(config.scene, config.experts.test, dataset.TEST)
     shown = jax.tree.map(lambda x: x[:episodes], test)
-    _, state, _ = run.restore(evaluate.start_shapes(learner, config))
+    _, state, _ = run.restore(start_shapes(learner, config.all_seeds))
     agent = learner.agent(jax.tree.map(lambda x: x[seed_index], state.networks))
 
     def play(demonstration: Demonstration, key: jax.Array) -> Trajectory:
@@ -49,9 +51,9 @@ def rollouts(run: Run, episodes: int, types: int, seed_index: int) -> tuple[Demo
         g = SOURCES[learner.method.test_types](agent, demonstration, draw).agent_type
         return learner.play(agent, demonstration.episode, g, noise)
 
-    keys = random.split(random.key(evaluate.NOISE), (min(episodes, config.experts.test), types))
+    keys = random.split(stream("evaluation", 0), (min(episodes, config.experts.test), types))
     inner = jax.vmap(play, in_axes=(None, 0))
-    return shown, jax.device_get(jax.jit(jax.vmap(inner))(evaluate.without_truth(shown), keys))
+    return shown, jax.device_get(jax.jit(jax.vmap(inner))(dataset.without_truth(shown), keys))
 
 
 def stage(world: World, body: str, actors: int, marks: int, size: tuple[int, int]) -> mujoco.MjModel:

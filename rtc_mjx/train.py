@@ -15,13 +15,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
-from jax import random
 
 from rtc_mjx import cache, cli, dataset, evaluate
 from rtc_mjx import config as settings
 from rtc_mjx.config import Config
 from rtc_mjx.errors import RunError
-from rtc_mjx.learner import Learner, TrainState, compiled_chunk
+from rtc_mjx.keys import stream
+from rtc_mjx.learner import Learner, TrainState, compiled_chunk, start_all, start_shapes
 from rtc_mjx.progress import Reporter
 from rtc_mjx.runs import Run
 
@@ -43,11 +43,11 @@ def train(config: Config) -> Run:
 
 def learn(run: Run, config: Config) -> None:
     """The training loop."""
-    expert = dataset.demonstrations(config.scene, config.experts.train, evaluate.TRAIN_DATA)
-    learner = evaluate.learner_for(config, expert)
+    expert = dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN)
+    learner = config.learner(dataset.statistics(expert))
     state, update, before = begin(run, learner, config)
     test = Tests(config, learner)
-    chunks, data = functools.cache(functools.partial(compiled_chunk, learner)), evaluate.without_truth(expert)
+    chunks, data = functools.cache(functools.partial(compiled_chunk, learner)), dataset.without_truth(expert)
     started = time.perf_counter() - before
     with Reporter(run, config, update) as report, Interruption() as interrupted:
         while update < config.updates:
@@ -72,8 +72,8 @@ def begin(run: Run, learner: Learner, config: Config) -> tuple[TrainState, int, 
     run.clear_unfinished()
     if not (config.resume and any(True for _ in run.checkpoints())):
         run.rewind(0)
-        return evaluate.start_all(learner, config), 0, 0.0
-    update, state, wall = run.restore(evaluate.start_shapes(learner, config))
+        return start_all(learner, config.all_seeds), 0, 0.0
+    update, state, wall = run.restore(start_shapes(learner, config.all_seeds))
     run.rewind(update)
     run.set_aside_after(update)
     return state, update, wall
@@ -84,13 +84,13 @@ class Tests:
 
     def __init__(self, config: Config, learner: Learner) -> None:
         self.config, self.roll = config, evaluate.roller(learner)
-        demonstrations = dataset.demonstrations(config.scene, config.experts.test, evaluate.TEST_DATA)
+        demonstrations = dataset.demonstrations(config.scene, config.experts.test, dataset.TEST)
         self.expert = evaluate.expert_features(config, demonstrations)
-        self.episodes = evaluate.without_truth(demonstrations)
+        self.episodes = dataset.without_truth(demonstrations)
 
     def __call__(self, state: TrainState) -> dict[str, list[float]]:
         """Metrics by name; those under other types than the prior's are prefixed."""
-        features = jax.device_get(self.roll(state.networks, self.episodes, random.key(evaluate.NOISE)))
+        features = jax.device_get(self.roll(state.networks, self.episodes, stream("evaluation", 0)))
         scores = evaluate.score(self.config, features, self.expert)
         named = {source: f"{source}/" if source != "prior" else "" for source in scores}
         return {named[source] + name: values for source, table in scores.items() for name, values in table.items()}

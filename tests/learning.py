@@ -6,7 +6,7 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from rtc_mjx import dataset, evaluate
+from rtc_mjx import dataset
 from rtc_mjx.config import Config, Experts, Intervals
 from rtc_mjx.learner import Learner, OptimiserOptions, start
 from rtc_mjx.losses import LossWeights
@@ -51,6 +51,6 @@ def begin(learner, seed=0):
     """A fresh state, in the precision at hand, and a minibatch."""
     state = start(learner, jnp.array(seed))
     demonstrations = experts(jnp.zeros(0).dtype == jnp.float64)
-    batch = jax.tree.map(lambda x: x[: learner.batch], evaluate.without_truth(demonstrations))
+    batch = jax.tree.map(lambda x: x[: learner.batch], dataset.without_truth(demonstrations))
     wide = jax.tree.map(lambda x: x.astype(jnp.zeros(0).dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, state)
     return wide, batch

@@ -248,10 +248,11 @@ def test_gradient_modes_cut_what_they_say(x64):
 
 def test_a_trajectory_that_is_not_finite_is_dropped_and_counted():
     gradient = jnp.ones((4, 3, 2)).at[1, 0, 0].set(jnp.nan)
-    kept, report = learning.guard(gradient, jnp.array([True, True, False, True]), largest=1.0)
+    kept, report = learning.guard(gradient, jnp.array([True, True, False, True]), np.array([1, 3, 3, 3]), largest=1.0)
     assert report["trajectories_dropped"] == 2 and np.all(np.isfinite(kept))
     assert np.all(kept[1:3] == 0) and np.all(kept[0] > 0)
-    assert np.allclose(np.linalg.norm(np.asarray(kept[0])) * 4, 1.0)  # clipped: its norm was 4 sqrt(6)
+    lengths = np.linalg.norm(np.asarray(kept), axis=(1, 2))
+    assert np.allclose(lengths[[0, 3]] * [1, 3], 1.0)  # clipped: the norms of their own losses were sqrt(6) and 3 sqrt(6)
 
 
 def test_a_rollout_that_is_not_finite_does_not_spoil_an_update():

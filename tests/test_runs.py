@@ -232,7 +232,7 @@ def test_evaluation_has_what_the_interface_says(evaluated):
     assert evaluated["types"]["prior"] == evaluated["metrics"]
     low, high = evaluated["metrics"]["return"]["interval"]
     assert low <= evaluated["metrics"]["return"]["mean"] <= high
-    assert evaluated["reference"]["expert"]["jsd_goal"] == 0 < evaluated["reference"]["expert"]["return"]
+    assert evaluated["reference"]["expert"]["jsd_goal"] == 0 < evaluated["reference"]["expert"]["lower"]
 
 
 def test_evaluation_is_repeatable(whole, evaluated):
@@ -438,3 +438,12 @@ def test_exit_statuses(tmp_path):
     assert done.returncode == 0, done.stderr
     assert re.search(r"^update 20/20 .*return", done.stderr, re.M) and "\x1b" not in done.stderr + done.stdout
     assert "expert" in done.stdout and jax.tree.leaves(json.loads((tmp_path / "r" / "evaluation.json").read_text()))
+
+
+def test_settings_that_lack_a_key_are_not_completed_with_todays_defaults(tmp_path):
+    config.write(settings("bc"), tmp_path)
+    table = json.loads((tmp_path / "config.json").read_text())
+    del table["losses"]["type_kl"]
+    (tmp_path / "config.json").write_text(json.dumps(table))
+    with pytest.raises(UsageError, match="lacks losses.type_kl"):
+        config.read(tmp_path)

@@ -1,0 +1,12 @@
+"""Where randomness comes from: one independent stream a purpose, so that a training and its test data share nothing by sharing a seed."""
+
+from typing import Literal, get_args
+
+import jax
+
+Stream = Literal["networks", "updates", "demonstrations", "evaluation", "environment"]
+
+
+def stream(purpose: Stream, seed: jax.Array | int) -> jax.Array:
+    """The key of a purpose under a seed."""
+    return jax.random.fold_in(jax.random.key(seed), get_args(Stream).index(purpose))
