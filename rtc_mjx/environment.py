@@ -36,7 +36,9 @@ class Environment(dm_env.Environment):
         self._reset = jax.jit(scene.reset)
         self._look = jax.jit(lambda episode, time, state: (scene.observe(episode, time, state), scene.reward(episode, time, state)))
         self._advance = jax.jit(
-            lambda episode, time, state, action: advance(state, action, jax.tree.map(lambda x: x[time], episode.surroundings))
+            lambda episode, time, state, action: advance(
+                state, action, *(jax.tree.map(lambda x, at=at: x[at], episode.surroundings) for at in (time, time + 1))
+            )
         )
 
     @property

@@ -45,17 +45,17 @@ def rollout(
 
     def body(carry, inputs):  # type: ignore[no-untyped-def]  # scan's carry is any pytree
         memory, state = carry
-        time, around, noise = inputs
+        time, before, after, noise = inputs
         seen = see(time, state)
         memory, action = actor.act(memory, seen, noise)
-        after = advance(damp(state, 0.0 if gradient == "none" else decay), action, around)
-        return (memory, after), (state, seen, action)
+        reached = advance(damp(state, 0.0 if gradient == "none" else decay), action, before, after)
+        return (memory, reached), (state, seen, action)
 
     # A backward pass keeps what steps hand on and the contact solutions; what the actor computed is computed again: it is cheaper
     # than writing and reading all activations of all episodes.
     body = jax.checkpoint(body, policy=jax.checkpoint_policies.save_only_these_names(SOLUTION))
-    during = jax.tree.map(lambda x: x[:-1], episode.surroundings)
-    inputs = (jnp.arange(scene.steps), during, actor.noise)
+    before, after = (jax.tree.map(lambda x, part=part: x[part], episode.surroundings) for part in (slice(None, -1), slice(1, None)))
+    inputs = (jnp.arange(scene.steps), before, after, actor.noise)
     (_, last), (states, seen, actions) = lax.scan(body, (actor.memory, episode.start), inputs)
     end = see(jnp.array(scene.steps), last)
     states, seen = jax.tree.map(lambda xs, x: jnp.concatenate([xs, x[None]]), (states, seen), (last, end))

@@ -90,7 +90,7 @@ def _rows_stage(world: World, state: PhysicsState, mode: Mode | None) -> tuple[C
     pose, size = jnp.zeros(3), jnp.zeros(2)
     halve, restore = (_halved, _restored) if _is_flat_pyramid(world.one_user) else (lambda rows: rows, lambda rows: rows)
     rows, expand = compress(lambda s, p, z: halve(one_user_rows(world, s, p, z)), state, pose, size, mode=mode)
-    index = jnp.array(world.users, int)
+    index = np.array(world.users, int)  # not a device array: the program is kept, and may be made while another is traced
 
     def over_users(s: PhysicsState, around: Surroundings) -> Array:
         return jax.vmap(rows, in_axes=(None, 0, 0))(s, around.pose[index], around.size[index])

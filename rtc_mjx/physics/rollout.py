@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
@@ -12,6 +13,7 @@ from rtc_mjx.physics.contact import SOLUTION
 from rtc_mjx.physics.step import PhysicsState, Surroundings, constraint_rows, step
 from rtc_mjx.physics.world import World
 
+JUMP = 20.0  # m in a control step: nothing drives that far, it appears or goes
 OneStep = Callable[[PhysicsState, Array, Surroundings], PhysicsState]
 
 
@@ -56,8 +58,10 @@ def simulate(
     return lax.scan(body, state, (controls, surroundings if played else None))
 
 
-def control_step(world: World, substeps: int, one_step: OneStep, plain: bool = False) -> OneStep:
+def control_step(world: World, substeps: int, one_step: OneStep, plain: bool = False) -> Callable[..., PhysicsState]:
     """One control step: physics steps under one control, so checkpointed that a backward pass keeps little.
+
+    The function returned takes the state, the control, the surroundings before the step and, where they move, those after it.
 
     Kept are the state before each control step and, while one control step is gone back through, the contact solutions of its
     physics steps. A specialised step in one piece (no constraint rows, not `plain`) keeps its inputs only as it is.
@@ -66,12 +70,39 @@ def control_step(world: World, substeps: int, one_step: OneStep, plain: bool = F
     if plain or constraint_rows(world):
         advance = jax.checkpoint(advance, policy=jax.checkpoint_policies.save_only_these_names(SOLUTION))
     if substeps == 1:
-        return advance
+        return lambda state, control, before, after=None: advance(state, control, before)
 
-    def several(state: PhysicsState, control: Array, around: Surroundings) -> PhysicsState:
-        return lax.scan(lambda s, _: (advance(s, control, around), None), state, length=substeps)[0]
+    def several(state: PhysicsState, control: Array, before: Surroundings, after: Surroundings | None = None) -> PhysicsState:
+        return lax.scan(lambda s, share: (advance(s, control, between(before, after, share)), None), state, shares(substeps))[0]
 
     return jax.checkpoint(several)
+
+
+def substates(world: World, substeps: int, one_step: OneStep) -> Callable[..., tuple[PhysicsState, Surroundings]]:
+    """Like `control_step`, but gives the states before each physics step, and the surroundings that it had."""
+
+    def several(state: PhysicsState, control: Array, before: Surroundings, after: Surroundings) -> tuple[PhysicsState, Surroundings]:
+        def body(state: PhysicsState, share: Array) -> tuple[PhysicsState, tuple[PhysicsState, Surroundings]]:
+            around = between(before, after, share)
+            return one_step(state, control, around), (state, around)
+
+        return lax.scan(body, state, shares(substeps))[1]
+
+    return several
+
+
+def shares(substeps: int) -> Float[Array, "substeps"]:
+    """How much of a control step has passed before each of its physics steps."""
+    return jnp.arange(substeps) / substeps
+
+
+def between(before: Surroundings, after: Surroundings | None, share: Array) -> Surroundings:
+    """Surroundings within a control step: bodies move straight on; one that is somewhere else altogether afterwards jumps at the end."""
+    if after is None:
+        return before
+    way = after.pose - before.pose
+    jumps = jnp.any(jnp.abs(way[..., :2]) > JUMP, axis=-1, keepdims=True)
+    return Surroundings(before.pose + jnp.where(jumps, 0.0, share * way), before.size)
 
 
 def check_inputs(world: World, state: PhysicsState, controls: Array, surroundings: Surroundings) -> None:

@@ -233,8 +233,9 @@ def _one_user_part(spec: mujoco.MjSpec, users: Sequence[str]) -> Part:
     model = _without(spec, users[1:])
     body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, users[0])
     geom = _collision_geom(model, body)
-    device = mjx.put_model(model, impl="jax")
-    contacts = jax.jit(lambda data: mjx.collision(device, data)._impl.contact)(mjx.make_data(model, impl="jax"))
+    with jax.ensure_compile_time_eval():  # a world may be asked for first while a program is traced
+        device = mjx.put_model(model, impl="jax")
+        contacts = jax.jit(lambda data: mjx.collision(device, data)._impl.contact)(mjx.make_data(model, impl="jax"))
     rows = [
         int(first) + k
         for first, dim, pair in zip(*(np.asarray(x) for x in (contacts.efc_address, contacts.dim, contacts.geom)), strict=True)

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rtc_mjx.physics import PhysicsState, World
-from rtc_mjx.trajectory import Episode, Trajectory
+from rtc_mjx.trajectory import Demonstration, Episode, Trajectory
 
 Act = Callable[[Any, Array, Any], tuple[Any, Array]]  # (memory, observation, noise of one step) -> (memory, action)
 
@@ -36,6 +36,21 @@ class Actor:
 
 
 @dataclass(frozen=True)
+class ItemSet:
+    """A set of items within an observation.
+
+    Attributes:
+        name: of the set.
+        count: items that fit.
+        size: numbers of an item; the first is 1 where there is an item and 0 where not, and then the others are 0 too.
+    """
+
+    name: str
+    count: int
+    size: int
+
+
+@dataclass(frozen=True)
 class Scene(abc.ABC):
     """Base of all scenes; subclasses add their settings as fields.
 
@@ -47,8 +62,19 @@ class Scene(abc.ABC):
     substeps: ClassVar[int] = 1
     main_metrics: ClassVar[tuple[str, ...]] = ()
     agent_body: ClassVar[str] = "agent"
-    labels: ClassVar[int] = 0  # how many hand-made types there are (Symphony)
+    samples: ClassVar[int] = 1  # rollouts of each test episode, every one with a type of its own
+    reconstructs_rollouts: ClassVar[bool] = False  # whether L_rec compares rollouts (`discrepancy`) rather than actions
     steps: int = field(default=60)
+
+    @property
+    def labels(self) -> int:
+        """How many hand-made types there are (Symphony); each points at an item of the first of `sets`."""
+        return 0
+
+    @property
+    def sets(self) -> tuple[ItemSet, ...]:
+        """What observations end with: sets of items, whose order means nothing."""
+        return ()
 
     @functools.cached_property
     @abc.abstractmethod
@@ -77,13 +103,22 @@ class Scene(abc.ABC):
         """An expert for the episode, and its internal truth (for analysis only)."""
 
     @abc.abstractmethod
-    def label(self, trajectory: Trajectory) -> Array | None:
+    def label(self, demonstration: Demonstration) -> Array | None:
         """Symphony's hand-made type of a demonstration as a one-hot vector; None where the scene has none."""
 
+    def discrepancy(self, demonstration: Demonstration, trajectory: Trajectory) -> Float[Array, ""]:
+        """L_rec between a demonstration and a rollout, where the scene `reconstructs_rollouts`."""
+        raise NotImplementedError(f"scene {self.name} reconstructs actions")
+
     @abc.abstractmethod
-    def features(self, episode: Episode, trajectory: Trajectory) -> dict[str, Array]:
-        """The numbers of one trajectory that metrics compare between populations."""
+    def features(self, demonstration: Demonstration, trajectory: Trajectory) -> dict[str, Array]:
+        """The numbers of one trajectory that metrics compare between populations; `demonstration` is the expert's of the episode."""
 
     @abc.abstractmethod
     def metrics(self, features: dict[str, np.ndarray], expert: dict[str, np.ndarray]) -> dict[str, float]:
-        """The scene's metrics of one population of trajectories against the expert's."""
+        """The scene's metrics of one population of trajectories against the expert's.
+
+        Args:
+            features: of the population, with leading axes (samples, episodes).
+            expert: of the expert, with a leading axis of episodes.
+        """

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from rtc_mjx import metrics
 from rtc_mjx.physics import PhysicsState, Surroundings, World, load, rest_state
 from rtc_mjx.scenes.base import Actor, Scene
-from rtc_mjx.trajectory import Episode, Trajectory
+from rtc_mjx.trajectory import Demonstration, Episode, Trajectory
 
 GOAL_X = (-0.9, 0.9)  # m, goals are drawn in this range ...
 GOAL_Y = (0.35, 0.9)  # m, ... on either side of y = 0
@@ -97,17 +97,17 @@ class DoubleGoal(Scene):
 
         return Actor((), act, noise), {"goal": goal[-1], "bend": bend}
 
-    def label(self, trajectory: Trajectory) -> None:
+    def label(self, demonstration: Demonstration) -> None:
         """The double goal problem has no hand-made label: Symphony does not run on it."""
 
-    def features(self, episode: Episode, trajectory: Trajectory) -> dict[str, Array]:
+    def features(self, demonstration: Demonstration, trajectory: Trajectory) -> dict[str, Array]:
         """Steps spent at either goal, the side on which the episode ends, h = sign(y_T) (paper, section V-A), and the way its path turns.
 
         The turn is not in the paper: like the goal it is the expert's own choice, half left and half right, and a population has both.
         """
         way = jnp.diff(trajectory.states.qpos, axis=0)
         turn = way[:-1, 0] * way[1:, 1] - way[:-1, 1] * way[1:, 0]  # positive to the left
-        rewards = jax.vmap(self.reward, in_axes=(None, 0, 0))(episode, jnp.arange(self.steps + 1), trajectory.states)
+        rewards = jax.vmap(self.reward, in_axes=(None, 0, 0))(demonstration.episode, jnp.arange(self.steps + 1), trajectory.states)
         return {
             "return": jnp.sum(rewards[1:]),
             "upper": (trajectory.states.qpos[-1, 1] > 0).astype(int),

@@ -1,0 +1,150 @@
+"""Plane geometry of roads and road users: paths, boxes, capsules, road edges. Metres and radians, x forward, y left, z up.
+
+A path is an array of points at a constant spacing along its arc length, so that a station (m from its first point) is an index.
+"""
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+Point = Float[Array, "2"]
+Pose = Float[Array, "3"]
+
+
+def rotate(vector: Float[Array, "*batch 2"], angle: Float[Array, "*batch"]) -> Float[Array, "*batch 2"]:
+    """The vector turned to the left by an angle."""
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([cos * vector[..., 0] - sin * vector[..., 1], sin * vector[..., 0] + cos * vector[..., 1]], axis=-1)
+
+
+def wrapped(angle: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """The same direction between -pi and pi."""
+    return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
+
+
+def cross(a: Float[Array, "*batch 2"], b: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
+    """Z of the cross product: positive where b points to the left of a."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def length(vector: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
+    """Euclidean norm with a finite derivative at zero."""
+    return jnp.sqrt(jnp.sum(vector**2, axis=-1) + 1e-12)
+
+
+def resample(points: Float[Array, "points 2"], stations: Float[Array, "stations"]) -> Float[Array, "stations 2"]:
+    """A polyline at stations in m along it; beyond its ends it goes straight on. Points that repeat the one before add nothing."""
+    legs = jnp.diff(points, axis=0)
+    lengths = jnp.sqrt(jnp.sum(legs**2, axis=1))
+    along = jnp.concatenate([jnp.zeros(1), jnp.cumsum(lengths)])
+    leg = jnp.clip(jnp.searchsorted(along, stations, side="right") - 1, 0, len(legs) - 1)
+    real = lengths > 1e-6
+    indices = jnp.arange(len(legs))
+    first, last = jnp.argmax(real), len(legs) - 1 - jnp.argmax(real[::-1])
+    before = lax.cummax(jnp.where(real, indices, first))  # a leg of no length stands for the one before it
+    leg = jnp.clip(before[leg], first, last)
+    return points[leg] + ((stations - along[leg]) / jnp.maximum(lengths[leg], 1e-6))[:, None] * legs[leg]
+
+
+def polyline_length(points: Float[Array, "points 2"]) -> Float[Array, ""]:
+    """Its length in m."""
+    return jnp.sum(jnp.sqrt(jnp.sum(jnp.diff(points, axis=0) ** 2, axis=1)))
+
+
+def pose_at(path: Float[Array, "points 2"], spacing: float, station: Float[Array, ""]) -> Pose:
+    """Point and heading of a path at a station; beyond its ends it goes straight on."""
+    leg = jnp.clip(jnp.floor(station / spacing).astype(int), 0, path.shape[0] - 2)
+    leg = lax.stop_gradient(leg)
+    way = path[leg + 1] - path[leg]
+    point = path[leg] + (station / spacing - leg) * way
+    return jnp.concatenate([point, jnp.arctan2(way[1], way[0])[None]])
+
+
+def project(path: Float[Array, "points 2"], spacing: float, point: Point) -> tuple[Array, Array, Array]:
+    """The nearest point of a path: its station in m, how far to its left `point` lies in m, and the heading there."""
+    nearest = jnp.argmin(jnp.sum((lax.stop_gradient(point) - path) ** 2, axis=1))
+    ways = path[1:] - path[:-1]
+    before, after = jnp.maximum(nearest - 1, 0), jnp.minimum(nearest, path.shape[0] - 2)
+
+    def along(leg: Array) -> Array:
+        return jnp.sum((point - path[leg]) * ways[leg]) / jnp.sum(ways[leg] ** 2)
+
+    leg = jnp.where(along(after) >= 0, after, before)
+    way = ways[leg]
+    station = spacing * (leg + along(leg))
+    return station, cross(way, point - path[leg]) / length(way), jnp.arctan2(way[1], way[0])
+
+
+def curvature(path: Float[Array, "points 2"], spacing: float) -> Float[Array, "points"]:
+    """1/m at every point of a path, positive to the left; that of its neighbours at its ends."""
+    ways = jnp.diff(path, axis=0)
+    headings = jnp.arctan2(ways[:, 1], ways[:, 0])
+    inner = wrapped(jnp.diff(headings)) / spacing
+    return jnp.concatenate([inner[:1], inner, inner[-1:]])
+
+
+def corners(pose: Float[Array, "*batch 3"], size: Float[Array, "*batch 2"]) -> Float[Array, "*batch 4 2"]:
+    """Corners of a box of (length, width): front left, front right, rear right, rear left."""
+    signs = jnp.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
+    offsets = 0.5 * signs * size[..., None, :]
+    return pose[..., None, :2] + rotate(offsets, pose[..., None, 2])
+
+
+def point_to_segment(point: Float[Array, "*batch 2"], a: Float[Array, "*batch 2"], b: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
+    """Distance in m of a point from a segment."""
+    way = b - a
+    share = jnp.clip(jnp.sum((point - a) * way, axis=-1) / jnp.maximum(jnp.sum(way**2, axis=-1), 1e-12), 0, 1)
+    return length(point - a - share[..., None] * way)
+
+
+def segment_distance(
+    a: Float[Array, "*batch 2"], b: Float[Array, "*batch 2"], c: Float[Array, "*batch 2"], d: Float[Array, "*batch 2"]
+) -> Float[Array, "*batch"]:
+    """Distance in m between the segments ab and cd; zero where they cross."""
+    ends = [point_to_segment(a, c, d), point_to_segment(b, c, d), point_to_segment(c, a, b), point_to_segment(d, a, b)]
+    split = (cross(b - a, c - a) * cross(b - a, d - a) < 0) & (cross(d - c, a - c) * cross(d - c, b - c) < 0)
+    return jnp.where(split, 0.0, jnp.min(jnp.stack(ends), axis=0))
+
+
+def capsule_gap(pose: Pose, size: Point, others: Float[Array, "n 3"], sizes: Float[Array, "n 2"]) -> Float[Array, "n"]:
+    """Distance in m between collision capsules, as the physics has them; negative where they touch."""
+
+    def ends(pose: Array, size: Array) -> tuple[Array, Array, Array]:
+        radius = 0.5 * jnp.minimum(size[..., 0], size[..., 1])
+        half = 0.5 * jnp.maximum(size[..., 0] - size[..., 1], 0)
+        way = half[..., None] * jnp.stack([jnp.cos(pose[..., 2]), jnp.sin(pose[..., 2])], axis=-1)
+        return pose[..., :2] - way, pose[..., :2] + way, radius
+
+    (a, b, mine), (c, d, theirs) = ends(pose, size), ends(others, sizes)
+    a, b = jnp.broadcast_to(a, c.shape), jnp.broadcast_to(b, d.shape)
+    return segment_distance(a, b, c, d) - mine - theirs
+
+
+def boxes_overlap(pose: Pose, size: Point, others: Float[Array, "n 3"], sizes: Float[Array, "n 2"]) -> Bool[Array, "n"]:
+    """Whether oriented boxes overlap: no axis of either separates them."""
+    away = others[:, :2] - pose[:2]
+
+    def axes(heading: Array) -> Array:
+        return jnp.stack([jnp.stack([jnp.cos(heading), jnp.sin(heading)], -1), jnp.stack([-jnp.sin(heading), jnp.cos(heading)], -1)], -2)
+
+    mine, theirs = jnp.broadcast_to(axes(pose[2]), (len(others), 2, 2)), axes(others[:, 2])
+    tried = jnp.concatenate([mine, theirs], axis=1)  # (n, 4, 2)
+
+    def reach(frame: Array, size: Array) -> Array:
+        return 0.5 * jnp.sum(jnp.abs(jnp.einsum("nij,nkj->nik", frame, tried)) * size[:, :, None], axis=1)
+
+    gap = jnp.abs(jnp.einsum("nj,nkj->nk", away, tried)) - reach(mine, jnp.broadcast_to(size, sizes.shape)) - reach(theirs, sizes)
+    return jnp.all(gap < 0, axis=1)
+
+
+def off_road(point: Point, edges: Float[Array, "edges 2 2"], valid: Bool[Array, "edges"]) -> Float[Array, ""]:
+    """Signed distance in m past the nearest road edge: positive off the road, negative on it. The road lies to an edge's left.
+
+    At a vertex two segments are equally near; the one that the point faces more squarely decides the side.
+    """
+    a, b = edges[:, 0], edges[:, 1]
+    distance = point_to_segment(jnp.broadcast_to(point, a.shape), a, b)
+    beside = -cross(b - a, point - a) / length(b - a)  # positive to the right
+    rank = jnp.where(valid, distance**2 - 1e-3 * beside**2, jnp.inf)
+    nearest = jnp.argmin(rank)
+    return jnp.where(jnp.any(valid), jnp.sign(beside[nearest]) * distance[nearest], -jnp.inf)

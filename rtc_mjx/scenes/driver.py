@@ -1,0 +1,157 @@
+"""The expert of generated driving scenes: a driver with a mind of its own, who knows no more than an observation tells.
+
+    observation -> the way ahead on its route -> steering (pure pursuit)
+                -> obstacles: bends, who is ahead, the stop line, who goes first -> the hardest braking that any of them asks for
+
+Internal to the driver, and drawn anew for each episode: route, speed, headway, the gap it takes, how late it sees a signal change,
+whether it still goes at amber, where in the lane it keeps.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+from jax import random
+from jaxtyping import Array, Float
+
+from rtc_mjx.scenes.base import Actor
+from rtc_mjx.scenes.driving import AHEAD, CAR, split
+from rtc_mjx.scenes.traffic import COMFORT, GRIP, follow_the_leader
+from rtc_mjx.trajectory import Episode
+
+if TYPE_CHECKING:
+    from rtc_mjx.scenes.driving import Driving
+
+WHEELBASE = 2.8  # m
+REAR = -CAR[0] / 2 + 0.9  # m, the rear axle from the car's centre
+GRID = tuple(1.5 * i for i in range(28))  # m along the route, where others are looked for
+AFTER = tuple(0.4 * i for i in range(13))  # s ahead, to which others are expected to go straight on
+WITHIN = {"vehicle": 2.1, "walker": 1.9}  # m from the middle of the way: ahead of me
+CROSSES = {"vehicle": 3.0, "walker": 2.4}  # m from the middle of the way: will be in it
+CANNOT_STOP = 7.5  # m/s^2: a line that takes harder braking is passed
+LATEST = 4  # control steps by which a driver may see a signal change late
+ROUTES = (0.9, 1.1, 0.9)  # how often each is taken, where there are three
+
+
+def expert_driver(key: jax.Array, scene: "Driving", episode: Episode, speeds: tuple[float, float]) -> tuple[Actor, Any]:
+    """A driver for an episode, and its internal truth."""
+    keys = iter(random.split(key, 10))
+    valid = episode.context.routes.valid
+    weight = jnp.where(valid, jnp.resize(jnp.array(ROUTES), valid.shape), 0.0)
+    inattentive, ignores = random.bernoulli(next(keys), 0.15), random.bernoulli(next(keys), 0.12)
+    truth = {
+        "route": random.choice(next(keys), len(valid), p=weight / jnp.sum(weight)),
+        "speed": random.uniform(next(keys), minval=speeds[0], maxval=speeds[1]),
+        "headway": random.uniform(next(keys), minval=0.9, maxval=1.9),
+        "gap": random.uniform(next(keys), minval=1.0, maxval=2.6),
+        "late": jnp.where(inattentive, 3, random.randint(next(keys), (), 0, 2)),
+        "amber_limit": jnp.where(ignores, -1.0, random.uniform(next(keys), minval=2.0, maxval=4.5)),
+        "aside": 0.15 * random.normal(next(keys)),
+    }
+    tremor = random.normal(next(keys), (scene.steps, 2)) * jnp.array([0.12, 0.006])
+
+    def act(memory: Array, observation: Array, noise: Array) -> tuple[Array, Array]:
+        own, items = split(scene, observation)
+        route, users = items["routes"][truth["route"]], items["road_users"]
+        seen = jnp.where(jnp.all(memory < 0), route[5:8], memory)  # at t = 0 nothing was seen before
+        memory = jnp.concatenate([route[None, 5:8], seen[:-1]])
+        pull = pedals(own, route, memory[truth["late"]], users, truth)
+        return memory, jnp.stack([pull, steering(own, route, truth["aside"])]) + noise
+
+    return Actor(jnp.full((LATEST, 3), -1.0), act, tremor), truth
+
+
+def way_ahead(route: Float[Array, "numbers"]) -> tuple[Float[Array, "points"], Float[Array, "points 2"]]:
+    """Stations in m ahead, and the points of the route there, in the car's frame; the first is beside the car."""
+    beside = -route[1] * jnp.stack([route[3], route[2]])  # aside of the route, seen from the car: (sin, cos) of the heading error
+    points = jnp.concatenate([beside[None], route[11:].reshape(-1, 2)])
+    return jnp.array([0.0, *AHEAD]), points
+
+
+def at(stations: Array, points: Array, wanted: Array) -> Float[Array, "*wanted 2"]:
+    """Points of the way ahead at stations."""
+    return jnp.stack([jnp.interp(wanted, stations, points[:, axis]) for axis in (0, 1)], axis=-1)
+
+
+def steering(own: Array, route: Array, aside: Array) -> Float[Array, ""]:
+    """Steering angle in rad that leads the rear axle to the route (pure pursuit), a little to one side of it."""
+    reach = jnp.clip(3.0 + 0.55 * own[0], 4.5, 12.0)
+    stations, points = way_ahead(route)
+    target = at(stations, points, reach) + jnp.array([-REAR, 0.0]) + jnp.array([0.0, 1.0]) * aside
+    far = jnp.sqrt(jnp.sum(target**2) + 1e-6)
+    return jnp.clip(jnp.arctan(2 * WHEELBASE * target[1] / far**2), -0.6, 0.6)
+
+
+def pedals(own: Array, route: Array, signal: Float[Array, "3"], users: Float[Array, "users 10"], truth: dict[str, Array]) -> Float[Array, ""]:
+    """Acceleration in m/s^2."""
+    speed = jnp.maximum(own[0], 0.0)
+    stations, points = way_ahead(route)
+    wanted = speed_for_bends(stations, points, truth["speed"])
+    asked = [follow_the_leader(speed, wanted, jnp.array(1e3), jnp.array(0.0), headway=truth["headway"])]
+    line = route[4] - CAR[0] / 2
+    needed = speed**2 / (2 * jnp.maximum(line, 0.1))
+    stops = (line > -1.0) & (((signal[0] > 0) & (needed < CANNOT_STOP)) | ((signal[1] > 0) & (needed < truth["amber_limit"])))
+    asked.append(jnp.where(stops, follow_the_leader(speed, wanted, line + 1.2, speed, headway=truth["headway"] / 2), 9.0))
+    grid = jnp.array(GRID)
+    way = at(stations, points, grid)
+    tangent = jnp.gradient(way, axis=0)
+    tangent /= jnp.sqrt(jnp.sum(tangent**2, axis=1, keepdims=True) + 1e-9)
+    gap, closing = ahead_of_me(way, tangent, grid, users, speed)
+    asked.append(jnp.min(follow_the_leader(speed, wanted, gap, closing, headway=truth["headway"])))
+    clash = first_clash(way, grid, users, speed, route, truth["gap"])
+    room = clash - CAR[0] / 2 - 1.5
+    asked.append(jnp.where(room > speed**2 / (2 * 6.0), follow_the_leader(speed, wanted, room, speed, headway=jnp.array(0.3)), 9.0))
+    return jnp.clip(jnp.min(jnp.stack(asked)), -8.0, 2.5)
+
+
+def speed_for_bends(stations: Array, points: Array, desired: Array) -> Float[Array, ""]:
+    """The speed from which all bends ahead can still be taken at GRIP after braking at COMFORT."""
+    legs = jnp.diff(points, axis=0)
+    heading = jnp.arctan2(legs[:, 1], legs[:, 0])
+    length = jnp.sqrt(jnp.sum(legs**2, axis=1) + 1e-6)
+    bend = jnp.abs(jnp.diff(heading)) / (0.5 * (length[1:] + length[:-1]))
+    allowed = jnp.sqrt(GRIP / jnp.maximum(bend, 1e-3) + 2 * COMFORT * jnp.maximum(0, stations[1:-1] - 2.0))
+    return jnp.minimum(desired, jnp.min(allowed))
+
+
+def ahead_of_me(way: Array, tangent: Array, grid: Array, users: Array, speed: Array) -> tuple[Float[Array, "users"], Float[Array, "users"]]:
+    """Of each road user: m to it along the way (far if it is not in it), and how fast that gap closes."""
+
+    def one(user: Array) -> tuple[Array, Array]:
+        half = jnp.where(user[9] > 0, 0.0, 0.5 * user[7] - 0.5)
+        spots = user[1:3] + jnp.array([-1.0, 0.0, 1.0])[:, None] * half * user[3:5]
+        reach = jnp.where(user[9] > 0, WITHIN["walker"], WITHIN["vehicle"])
+        inside = jnp.min(jnp.sqrt(jnp.sum((way[:, None] - spots) ** 2, axis=-1) + 1e-9), axis=1) < reach
+        behind = (user[1] < 0) & (jnp.abs(user[2]) < 2.5)
+        first = jnp.argmax(inside)
+        there = (user[0] > 0) & jnp.any(inside) & ~behind
+        gap = grid[first] + jnp.where(user[9] > 0, -0.5, 0.8) - CAR[0] / 2
+        along = jnp.maximum(0.0, jnp.sum(user[5:7] * tangent[first]))
+        return jnp.where(there, jnp.maximum(gap, 0.3), 1e3), jnp.where(there, speed - along, 0.0)
+
+    return jax.vmap(one)(users)
+
+
+def first_clash(way: Array, grid: Array, users: Array, speed: Array, route: Array, margin: Array) -> Float[Array, ""]:
+    """M along the way to where somebody who goes first would cross it about when I am there; far if nobody would.
+
+    People on foot always go first. Vehicles do where the route gives way, until it is clear of them.
+    """
+    mine = (-speed + jnp.sqrt(speed**2 + 2 * 1.5 * grid)) / 1.5
+    mine = jnp.maximum(mine, grid / 7.0)
+    after = jnp.array(AFTER)
+
+    def one(user: Array) -> Array:
+        walks = user[9] > 0
+        moving = jnp.sum(user[5:7] ** 2) > 0.25
+        spots = user[1:3] + after[:, None] * user[5:7]
+        reach = jnp.where(walks, CROSSES["walker"], CROSSES["vehicle"])
+        meets = jnp.sqrt(jnp.sum((way[:, None] - spots) ** 2, axis=-1)) < reach  # (grid, after)
+        early, late = jnp.where(walks, 1.2, margin), jnp.where(walks, 1.0, 0.8)
+        when = (after > mine[:, None] - late - 0.4) & (after < mine[:, None] + early)
+        same_way = jnp.sum(user[5:7] * jnp.array([1.0, 0.0])) > 0.8 * jnp.sqrt(jnp.sum(user[5:7] ** 2) + 1e-6)
+        goes_first = walks | ((route[9] > 0) & ~same_way)
+        clashes = jnp.any(meets & when, axis=1)
+        return jnp.where((user[0] > 0) & moving & goes_first & jnp.any(clashes), grid[jnp.argmax(clashes)] - reach, 1e3)
+
+    return jnp.min(jax.vmap(one)(users))
