@@ -6,14 +6,14 @@ A type space turns the raw outputs of a network into a distribution over types. 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from rtc_mjx.distributions import Distribution, Gaussian, GaussianMixture, OneHot
+from rtc_mjx.distributions import Choice, Distribution, Gaussian, GaussianMixture, OneHot
 from rtc_mjx.errors import UsageError
 from rtc_mjx.pytree import pytree
 
@@ -30,6 +30,10 @@ class TypeSpace(Protocol):
     @property
     def size(self) -> int:
         """Length of a type vector."""
+
+    @property
+    def points(self) -> bool:
+        """Whether a type points at one of the items of the observation's first set (of the routes)."""
 
     @property
     def posterior_outputs(self) -> int:
@@ -60,6 +64,7 @@ class NoType:
     """The space of methods without types: vectors of length zero."""
 
     size: int = 0
+    points: ClassVar[bool] = False
     posterior_outputs: int = 0
     prior_outputs: int = 0
 
@@ -85,6 +90,7 @@ class Continuous:
 
     size: int
     components: int
+    points: ClassVar[bool] = False
 
     @property
     def posterior_outputs(self) -> int:
@@ -129,6 +135,7 @@ class Discrete:
     """
 
     size: int
+    points: ClassVar[bool] = False
 
     @property
     def posterior_outputs(self) -> int:
@@ -153,6 +160,21 @@ class Discrete:
     def fixed_prior(self) -> OneHot:
         """All categories alike."""
         return OneHot(jnp.zeros(self.size))
+
+
+@dataclass(frozen=True)
+class Pointing(Discrete):
+    """One of the items of the observation's first set: a route (Symphony). Its prior reads the first observation.
+
+    Attributes:
+        size: items that fit.
+    """
+
+    points: ClassVar[bool] = True
+
+    def prior(self, outputs: Array) -> Choice:
+        """The choice that the logits stand for."""
+        return Choice(outputs)
 
 
 @pytree
@@ -196,7 +218,7 @@ def from_fixed_prior(agent: "Agent", demonstration: "Demonstration", key: Array)
 
 def from_prior(agent: "Agent", demonstration: "Demonstration", key: Array) -> Typed:
     """g_p ~ p(g), with p held fixed: nothing flows back into the prior (paper, eq. 3)."""
-    prior = agent.prior()
+    prior = agent.prior(demonstration.trajectory.observations[0])
     return Typed(lax.stop_gradient(prior.sample(prior.noise(key))), None)  # p fixed
 
 
@@ -218,15 +240,16 @@ def from_inference(agent: "Agent", demonstration: "Demonstration", key: Array) -
 
 
 def from_label(agent: "Agent", demonstration: "Demonstration", key: Array) -> Typed:
-    """Symphony: the hand-made label of the demonstration.
+    """Symphony: the hand-made label of the demonstration; one of them, where several fit alike.
 
     Raises:
         UsageError: the scene has none.
     """
-    label = agent.scene.label(demonstration.trajectory)
+    label = agent.scene.label(demonstration)
     if label is None:
         raise UsageError(f"scene {agent.scene.name} has no hand-made labels")
-    return Typed(label, None)
+    drawn = Choice(jnp.log(jnp.maximum(label, 1e-9)))
+    return Typed(lax.stop_gradient(drawn.sample(drawn.noise(key))), None)
 
 
 SOURCES: dict[str, Source] = {

@@ -190,7 +190,7 @@ def updates(method: str, rounds: int, seed_counts: Sequence[int] = (1, 8)) -> li
     """Milliseconds an update of a method on the double goal takes, on MJX and on a hand-written point mass, for numbers of seeds."""
     settings = config.defaults("double_goal", method)
     expert = dataset.demonstrations(settings.scene, 1024, dataset.TRAIN)
-    learner, data = settings.learner(dataset.statistics(expert)), dataset.without_truth(expert)
+    learner, data = settings.learner(dataset.statistics(settings.scene, expert)), dataset.without_truth(expert)
     timestep = settings.scene.world.timestep
 
     def by_hand(state: PhysicsState, force: Array, around: Surroundings) -> PhysicsState:

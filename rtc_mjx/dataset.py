@@ -9,7 +9,6 @@ import os
 import tempfile
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -57,8 +56,8 @@ def demonstrations(scene: Scene, count: int, seed: int) -> Demonstration:
 def fingerprint(scene: Scene, count: int, seed: int) -> str:
     """Hash of what determines a set of demonstrations: settings, code, compiled world, versions, precision, count, seed."""
     here = Path(__file__).parent
-    code = [Path(inspect.getfile(type(scene))), *(here / name for name in ("dataset.py", "keys.py", "rollout.py", "scenes/base.py"))]
-    code += [*sorted((here / "physics").glob("*.py")), *sorted((here / "specialise").glob("*.py"))]
+    code = [here / name for name in ("dataset.py", "keys.py", "rollout.py", "geometry.py")] + [Path(inspect.getfile(type(scene)))]
+    code += [file for folder in ("scenes", "logs", "physics", "specialise") for file in sorted((here / folder).glob("*.py"))]
     made_by = {
         "settings": dataclasses.asdict(scene),
         "code": hashlib.sha256(b"".join(file.read_bytes() for file in code)).hexdigest(),
@@ -71,15 +70,33 @@ def fingerprint(scene: Scene, count: int, seed: int) -> str:
     return hashlib.sha256(json.dumps(made_by, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def statistics(expert: Demonstration) -> Statistics:
-    """Mean and standard deviation of the expert's observations and actions over episodes and time."""
+def statistics(scene: Scene, expert: Demonstration) -> Statistics:
+    """Mean and standard deviation of the expert's observations and actions over episodes and time.
 
-    def moments(x: Any) -> tuple[jax.Array, jax.Array]:
-        flat = np.asarray(x, np.float64).reshape(-1, x.shape[-1])
-        scale = flat.std(axis=0)
-        return jnp.asarray(flat.mean(axis=0), jnp.float32), jnp.asarray(np.where(scale > 1e-6, scale, 1.0), jnp.float32)
+    Those of a set's items are over all its items that are there, and alike for all of them; whether one is there stays as it is.
+    """
+    seen = np.asarray(expert.trajectory.observations)
+    first = seen.shape[-1] - sum(held.count * held.size for held in scene.sets)
+    moments = [_moments(seen[..., :first])]
+    for held in scene.sets:
+        last = first + held.count * held.size
+        items = seen[..., first:last].reshape(-1, held.size)
+        mean, scale = _moments(items[items[:, 0] > 0.5])
+        mean[0], scale[0] = 0.0, 1.0
+        moments.append((np.tile(mean, held.count), np.tile(scale, held.count)))
+        first = last
+    observed = (np.concatenate(x) for x in zip(*moments, strict=True))
+    done = _moments(expert.trajectory.actions)
+    return Statistics(*(jnp.asarray(x, jnp.float32) for x in (*observed, *done)))
 
-    return Statistics(*moments(expert.trajectory.observations), *moments(expert.trajectory.actions))
+
+def _moments(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of the last axis; 1 for what never changes."""
+    flat = np.asarray(x, np.float64).reshape(-1, x.shape[-1])
+    if not len(flat):
+        return np.zeros(x.shape[-1]), np.ones(x.shape[-1])
+    scale = flat.std(axis=0)
+    return flat.mean(axis=0), np.where(scale > 1e-6, scale, 1.0)
 
 
 def without_truth(demonstrations: Demonstration) -> Demonstration:

@@ -131,6 +131,20 @@ class OneHot:
         return jnp.sum(p * (jnp.log(p) - jnp.log(q)), axis=-1)
 
 
+@pytree
+class Choice(OneHot):
+    """A categorical variable as a one-hot vector, as the logits say: a category far below the others is never drawn.
+
+    Attributes:
+        logits: log-probabilities, up to a constant.
+    """
+
+    @property
+    def probabilities(self) -> Float[Array, "*batch categories"]:
+        """Of each category."""
+        return jnp.maximum(jax.nn.softmax(self.logits), 1e-12)
+
+
 def kl(p: Distribution, q: Distribution, sample: Array) -> Array:
     """KL[p || q] in nats: closed form where both are of one kind that has it, else the one-sample estimate at `sample` of p."""
     if type(p) is type(q) and isinstance(p, Gaussian | OneHot):

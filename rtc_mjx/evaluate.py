@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import random
+from jax import lax, random
 from jaxtyping import Array
 from rich.console import Console
 from rich.table import Table
@@ -32,6 +32,7 @@ from rtc_mjx.models import Networks
 from rtc_mjx.runs import Run
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
+AT_ONCE = 2048  # rollouts simulated at once
 FINITE = "finite"  # the feature that says whether a rollout is
 Features = dict[str, np.ndarray]
 
@@ -45,7 +46,7 @@ Roll = Callable[[Networks, Demonstration, Array], dict[str, dict[str, Array]]]
 
 
 def roller(learner: Learner) -> Roll:
-    """A compiled function (networks of all seeds, test demonstrations, key) -> features per type source, (seeds, episodes)."""
+    """A compiled function (networks of all seeds, test demonstrations, key) -> features per type source, (seeds, samples, episodes)."""
     sources = type_sources(learner.method)
 
     def one(networks: Networks, mine: Demonstration, other: Demonstration, key: Array) -> dict[str, dict[str, Array]]:
@@ -58,14 +59,18 @@ def roller(learner: Learner) -> Roll:
             "shuffled": lambda: inferred(other, draw),
         }
         tracks = {name: learner.play(agent, mine.episode, ways[name]().agent_type, noise) for name in sources}
-        return {name: learner.scene.features(mine.episode, track) | {FINITE: _finite(track)} for name, track in tracks.items()}
+        return {name: learner.scene.features(mine, track) | {FINITE: _finite(track)} for name, track in tracks.items()}
 
     def all_episodes(networks: Networks, test: Demonstration, key: Array) -> dict[str, dict[str, Array]]:
+        count, samples = jax.tree.leaves(test)[0].shape[0], learner.scene.samples
         other = jax.tree.map(lambda x: jnp.roll(x, 1, axis=0), test)
-        keys = random.split(key, jax.tree.leaves(test)[0].shape[0])
-        return jax.vmap(functools.partial(one, networks))(test, other, keys)
+        several = jax.vmap(functools.partial(one, networks), in_axes=(None, None, 0))
+        keys = random.split(key, count) if samples == 1 else random.split(key, (count, samples))
+        inputs = (test, other, keys.reshape(count, samples))
+        features = lax.map(lambda held: several(*held), inputs, batch_size=min(count, max(1, AT_ONCE // samples)))
+        return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), features)
 
-    return jax.jit(jax.vmap(all_episodes, in_axes=(0, None, None)))
+    return jax.jit(lambda networks, test, key: lax.map(lambda held: all_episodes(held, test, key), networks))
 
 
 def _finite(track: Trajectory) -> Array:
@@ -74,7 +79,7 @@ def _finite(track: Trajectory) -> Array:
 
 def expert_features(config: Config, test: Demonstration) -> Features:
     """Features of the test demonstrations."""
-    return jax.device_get(jax.jit(jax.vmap(config.scene.features))(test.episode, test.trajectory))
+    return jax.device_get(jax.jit(jax.vmap(lambda held: config.scene.features(held, held.trajectory)))(dataset.without_truth(test)))
 
 
 def score(config: Config, features: dict[str, Features], expert: Features) -> dict[str, dict[str, list[float]]]:
@@ -97,7 +102,7 @@ def evaluate(run: Run, episodes: int) -> dict[str, Any]:
     config = run.config
     train = dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN)
     tests = [dataset.demonstrations(config.scene, episodes, seed) for seed in (dataset.TEST, dataset.SECOND_TEST)]
-    learner = config.learner(dataset.statistics(train))
+    learner = config.learner(dataset.statistics(config.scene, train))
     update, state, _ = run.restore(start_shapes(learner, config.all_seeds))
     features = jax.device_get(roller(learner)(state.networks, dataset.without_truth(tests[0]), stream("evaluation", 0)))
     expert, second = (expert_features(config, test) for test in tests)
@@ -120,7 +125,7 @@ def _summaries(config: Config, features: Features, expert: Features, values: dic
 
     def means_over_seeds(rows: np.ndarray) -> np.ndarray:
         reference = {k: v[rows] for k, v in expert.items()}
-        drawn = [{k: v[i][rows] for k, v in features.items()} for i in range(config.seeds)]
+        drawn = [{k: v[i][:, rows] for k, v in features.items()} for i in range(config.seeds)]
         return np.mean([list(config.scene.metrics(d, reference).values()) for d in drawn], axis=0)
 
     low, high = metrics.bootstrap(np.arange(len(next(iter(expert.values())))), means_over_seeds, draws=200)

@@ -121,20 +121,20 @@ def capsule_gap(pose: Pose, size: Point, others: Float[Array, "n 3"], sizes: Flo
 
 
 def boxes_overlap(pose: Pose, size: Point, others: Float[Array, "n 3"], sizes: Float[Array, "n 2"]) -> Bool[Array, "n"]:
-    """Whether oriented boxes overlap: no axis of either separates them."""
+    """Whether oriented boxes overlap: none of the four directions of their sides separates them."""
+    turned = others[:, 2] - pose[2]
+    cos, sin = jnp.abs(jnp.cos(turned)), jnp.abs(jnp.sin(turned))
     away = others[:, :2] - pose[:2]
 
-    def axes(heading: Array) -> Array:
-        return jnp.stack([jnp.stack([jnp.cos(heading), jnp.sin(heading)], -1), jnp.stack([-jnp.sin(heading), jnp.cos(heading)], -1)], -2)
+    def apart(heading: Array, mine: Array, theirs: Array) -> Array:
+        """Whether a direction of a box with that heading separates: `mine` (length, width) is its own, `theirs` the other's."""
+        ahead, aside = jnp.moveaxis(jnp.abs(rotate(away, jnp.broadcast_to(-heading, turned.shape))), -1, 0)
+        length, width = mine[..., 0], mine[..., 1]
+        along = 0.5 * (length + theirs[..., 0] * cos + theirs[..., 1] * sin)
+        across = 0.5 * (width + theirs[..., 0] * sin + theirs[..., 1] * cos)
+        return (ahead >= along) | (aside >= across)
 
-    mine, theirs = jnp.broadcast_to(axes(pose[2]), (len(others), 2, 2)), axes(others[:, 2])
-    tried = jnp.concatenate([mine, theirs], axis=1)  # (n, 4, 2)
-
-    def reach(frame: Array, size: Array) -> Array:
-        return 0.5 * jnp.sum(jnp.abs(jnp.einsum("nij,nkj->nik", frame, tried)) * size[:, :, None], axis=1)
-
-    gap = jnp.abs(jnp.einsum("nj,nkj->nk", away, tried)) - reach(mine, jnp.broadcast_to(size, sizes.shape)) - reach(theirs, sizes)
-    return jnp.all(gap < 0, axis=1)
+    return ~(apart(pose[2], size, sizes) | apart(others[:, 2], sizes, size))
 
 
 def off_road(point: Point, edges: Float[Array, "edges 2 2"], valid: Bool[Array, "edges"]) -> Float[Array, ""]:

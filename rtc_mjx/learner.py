@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int
 
 from rtc_mjx.agent_types import SOURCES, Typed, TypeSpace
 from rtc_mjx.keys import stream
-from rtc_mjx.losses import CLOSED_LOOP, LOSSES, Case, LossWeights, gradient_penalty
+from rtc_mjx.losses import LOSSES, Case, LossWeights, gradient_penalty, read_rollouts
 from rtc_mjx.methods import Branch, Method
 from rtc_mjx.models import Agent, ModelOptions, Networks, Statistics, make_networks
 from rtc_mjx.physics import OneStep
@@ -204,7 +204,7 @@ def gradients(learner: Learner, networks: Networks, batch: Demonstration, key: A
         alive = played.alive
 
         def by_rollouts(tracks: Trajectory) -> Array:
-            lost = branch_losses(learner, held, batch, now, Played(tracks, alive), extra, CLOSED_LOOP)
+            lost = branch_losses(learner, held, batch, now, Played(tracks, alive), extra, read_rollouts(learner.scene))
             return learner.weights.total(lost, update)
 
         cotangents, guarded = guard(
@@ -294,7 +294,7 @@ def branch_losses(
         cases = Case(mine, types, part.tracks, random.split(key, count))
         for name in (n for n in branch.losses if n in names):
             each = jax.vmap(lambda case, loss=LOSSES[name]: loss(agent, case, learner.weights))(cases)
-            sums[name] = sums.get(name, 0.0) + _mean(each, part.alive if name in CLOSED_LOOP else jnp.ones(count, bool))
+            sums[name] = sums.get(name, 0.0) + _mean(each, part.alive if name in read_rollouts(learner.scene) else jnp.ones(count, bool))
     return sums
 
 

@@ -17,6 +17,7 @@ from rtc_mjx import distributions
 from rtc_mjx.agent_types import Typed
 from rtc_mjx.models import Agent
 from rtc_mjx.pytree import pytree
+from rtc_mjx.scenes import Scene
 from rtc_mjx.trajectory import Demonstration
 
 KlDirection = Literal["posterior_prior", "prior_posterior"]
@@ -90,7 +91,12 @@ def cloning(agent: Agent, case: Case, weights: LossWeights) -> Array:
 
 
 def reconstruction(agent: Agent, case: Case, weights: LossWeights) -> Array:
-    """L_rec(tau, tau_hat): here -mean_t log pi(a_t | s_t, g_e) on the demonstration's states (paper, section V-A)."""
+    """L_rec(tau, tau_hat) (paper, section V): the scene's distance between demonstration and rollout, where it has one.
+
+    Otherwise -mean_t log pi(a_t | s_t, g_e) on the demonstration's states.
+    """
+    if agent.scene.reconstructs_rollouts:
+        return agent.scene.discrepancy(case.demonstration, case.rollout)
     return cloning(agent, case, weights)
 
 
@@ -103,7 +109,7 @@ def adversarial(agent: Agent, case: Case, weights: LossWeights) -> Array:
 
 def type_kl(agent: Agent, case: Case, weights: LossWeights) -> Array:
     """L_kl: KL[e(g|tau) || p(g)], whose minimiser over p is the marginal of the encoder; or the paper's literal KL[p || e]."""
-    prior, posterior = agent.prior(), case.typed.posterior
+    prior, posterior = agent.prior(case.demonstration.trajectory.observations[0]), case.typed.posterior
     if weights.kl_direction == "posterior_prior":
         return distributions.kl(posterior, prior, case.typed.agent_type)
     return distributions.kl(prior, posterior, prior.sample(prior.noise(case.key)))
@@ -117,7 +123,7 @@ def type_info(agent: Agent, case: Case, weights: LossWeights) -> Array:
 
 def type_nll(agent: Agent, case: Case, weights: LossWeights) -> Array:
     """-log p(label): Symphony's prior over its hand-made types, trained by cross-entropy."""
-    return -agent.prior().log_prob(case.typed.agent_type)
+    return -agent.prior(case.demonstration.trajectory.observations[0]).log_prob(case.typed.agent_type)
 
 
 LOSSES: dict[str, Loss] = {
@@ -128,7 +134,12 @@ LOSSES: dict[str, Loss] = {
     "type_info": type_info,
     "type_nll": type_nll,
 }
-CLOSED_LOOP = frozenset({"adversarial", "type_info"})  # losses that read the rollout
+CLOSED_LOOP = frozenset({"adversarial", "type_info"})  # losses that read the rollout ...
+
+
+def read_rollouts(scene: Scene) -> frozenset[str]:
+    """... in a scene: reconstruction does where the scene compares rollouts."""
+    return CLOSED_LOOP | ({"reconstruction"} if scene.reconstructs_rollouts else set())
 
 
 def gradient_penalty(agent: Agent, observations: Array, actions: Array) -> Array:

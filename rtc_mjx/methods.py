@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from rtc_mjx.agent_types import Continuous, Discrete, NoType, TypeSpace
+from rtc_mjx.agent_types import Continuous, Discrete, NoType, Pointing, TypeSpace
 from rtc_mjx.errors import UsageError
 from rtc_mjx.losses import CLOSED_LOOP
 from rtc_mjx.models import ModelOptions
@@ -74,7 +74,7 @@ class Method:
             "none": NoType(),
             "continuous": Continuous(options.type_size, options.prior_components),
             "discrete": Discrete(options.type_count),
-            "label": Discrete(labels),
+            "label": Pointing(labels),
         }
         return spaces[self.kind]
 

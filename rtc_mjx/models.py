@@ -1,10 +1,11 @@
 """The agent's networks: policy pi(a|s,g), encoder e(g|tau), prior p(g), discriminator D(s,a) and InfoMGAIL's Q(g|s,a).
 
-The networks are `flax.nnx` modules used as plain pytrees. `Agent` bundles them with what is not learned (input statistics, the
-type space, the scene) and gives each the name that the losses use. All functions take one trajectory or one step.
+`Agent` bundles the networks (`rtc_mjx.networks`) with what is not learned (input statistics, the type space, the scene) and gives
+each the name that the losses use. All functions take one trajectory or one step.
 """
 
-from collections.abc import Callable, Sequence
+import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +16,7 @@ from jaxtyping import Array, Float
 
 from rtc_mjx.agent_types import TypeSpace, mixture_of
 from rtc_mjx.distributions import Distribution, GaussianMixture
+from rtc_mjx.networks import Encoder, Layout, Reader, Scores
 from rtc_mjx.pytree import pytree
 from rtc_mjx.scenes import Actor, Scene
 from rtc_mjx.trajectory import Trajectory
@@ -46,35 +48,6 @@ class ModelOptions:
     type_size: int = 4
     type_count: int = 8
     prior_components: int = 8
-
-
-class MLP(nnx.Module):
-    """A multi-layer perceptron with tanh units and a last layer that starts small."""
-
-    def __init__(self, sizes: Sequence[int], rngs: nnx.Rngs, last_scale: float = 0.1) -> None:
-        def layer(a: int, b: int, scale: float) -> nnx.Linear:
-            return nnx.Linear(a, b, kernel_init=nnx.initializers.variance_scaling(scale, "fan_in", "truncated_normal"), rngs=rngs)
-
-        scales = [1.0] * (len(sizes) - 2) + [last_scale]
-        self.layers = nnx.List([layer(a, b, s) for a, b, s in zip(sizes[:-1], sizes[1:], scales, strict=True)])
-
-    def __call__(self, x: Array) -> Array:
-        """The outputs; leading axes of `x` are batch."""
-        for layer in self.layers[:-1]:
-            x = jnp.tanh(layer(x))
-        return self.layers[-1](x)
-
-
-class Encoder(nnx.Module):
-    """Reads a whole trajectory: a perceptron on each step, the mean over steps, a perceptron on that."""
-
-    def __init__(self, inputs: int, outputs: int, width: int, depth: int, rngs: nnx.Rngs) -> None:
-        self.step = MLP([inputs, *[width] * (depth + 1)], rngs, last_scale=1.0)
-        self.head = MLP([width, *[width] * (depth - 1), outputs], rngs)
-
-    def __call__(self, steps: Float[Array, "steps inputs"]) -> Float[Array, "outputs"]:
-        """The outputs for one trajectory."""
-        return self.head(jnp.tanh(jnp.mean(self.step(steps), axis=0)))
 
 
 @pytree
@@ -142,9 +115,18 @@ class Agent:
         return Actor((), act, (jax.vmap(draw)(jax.random.split(key, self.scene.steps)), nudge))
 
     def policy_outputs(self, observation: Array, agent_type: Array) -> Array:
-        """The policy network on one observation in the scene's units, or on an array of them, and a type."""
-        kind = jnp.broadcast_to(agent_type, (*observation.shape[:-1], self.space.size))
-        return self.networks.policy(jnp.concatenate([self._seen(observation), kind], axis=-1))
+        """The policy network on one observation in the scene's units, or on an array of them, and a type.
+
+        A type that points at an item of the observation's first set is shown as one more number of each of these items.
+        """
+        seen, kind = self._seen(observation), jnp.broadcast_to(agent_type, (*observation.shape[:-1], self.space.size))
+        if not self.space.points:
+            return self.networks.policy(jnp.concatenate([seen, kind], axis=-1))
+        layout = observation_layout(self.scene, seen.shape[-1])
+        own, (first, *rest) = layout.parts(seen)
+        marked = jnp.concatenate([first, kind[..., None]], axis=-1)
+        flat = [x.reshape(*own.shape[:-1], -1) for x in (own, marked, *rest)]
+        return self.networks.policy(jnp.concatenate(flat, axis=-1))
 
     def action_distribution(self, outputs: Array) -> GaussianMixture:
         """pi(a|s,g) from the policy's outputs: a mixture of Gaussians in the actuators' units."""
@@ -157,9 +139,9 @@ class Agent:
         steps = jnp.concatenate([self._seen(trajectory.observations), jnp.concatenate([self._done(trajectory.actions), last])], axis=-1)
         return self.space.posterior(self.networks.encoder(steps))
 
-    def prior(self) -> Distribution:
-        """p(g)."""
-        return self.space.prior(self.networks.prior)
+    def prior(self, observation: Array) -> Distribution:
+        """p(g), of an episode's first observation where types point at its items, otherwise the same for all episodes."""
+        return self.space.prior(self.networks.prior(self._seen(observation)) if self.space.points else self.networks.prior)
 
     def logit(self, observation: Array, action: Array) -> Array:
         """The discriminator's log-odds that the expert acted; it never sees the type."""
@@ -174,7 +156,12 @@ class Agent:
         return jnp.concatenate([self._seen(observation), self._done(action)], axis=-1)
 
     def _seen(self, observation: Array) -> Array:
-        return (observation - self.statistics.observation_mean) / self.statistics.observation_scale
+        standard = (observation - self.statistics.observation_mean) / self.statistics.observation_scale
+        if not self.scene.sets:
+            return standard
+        own, items = observation_layout(self.scene, observation.shape[-1]).parts(standard)
+        there = [jnp.where(x[..., :1] > 0.5, x, 0.0).reshape(*own.shape[:-1], -1) for x in items]  # an item that is not there says nothing
+        return jnp.concatenate([own, *there], axis=-1)
 
     def _done(self, action: Array) -> Array:
         return (action - self.statistics.action_mean) / self.statistics.action_scale
@@ -185,16 +172,25 @@ def output_count(options: ModelOptions, controls: int) -> int:
     return options.mixture * (1 + 2 * controls)
 
 
+def observation_layout(scene: Scene, features: int, extra: int = 0) -> Layout:
+    """How an observation of so many features is made up, with so many numbers after it."""
+    return Layout(features - sum(held.count * held.size for held in scene.sets), scene.sets, extra)
+
+
 def make_networks(key: Array, scene: Scene, features: int, space: TypeSpace, options: ModelOptions, parts: frozenset[str]) -> Networks:
     """Draws the networks of one seed; `parts` names the optional ones that the method has."""
     rngs, controls = nnx.Rngs(key), len(scene.world.control_ids)
-    hidden = [options.width] * options.depth
-    pair = features + controls
+    width, hidden = options.width, [options.width] * options.depth
+    pair, alone = observation_layout(scene, features, controls), observation_layout(scene, features)
+    typed = dataclasses.replace(alone, extra=space.size)
+    if space.points:
+        first, *rest = scene.sets
+        typed = dataclasses.replace(alone, sets=(dataclasses.replace(first, size=first.size + 1), *rest))
     builders: dict[str, Callable[[], Any]] = {
-        "policy": lambda: MLP([features + space.size, *hidden, output_count(options, controls)], rngs),
-        "encoder": lambda: Encoder(pair, space.posterior_outputs, options.width, options.depth, rngs),
-        "prior": lambda: jax.random.normal(rngs(), (space.prior_outputs,)),
-        "discriminator": lambda: MLP([pair, *[options.discriminator_width] * options.depth, 1], rngs),
-        "inference": lambda: MLP([pair, *hidden, space.posterior_outputs], rngs),
+        "policy": lambda: Reader(typed, hidden, output_count(options, controls), rngs),
+        "encoder": lambda: Encoder(pair, space.posterior_outputs, width, options.depth, rngs),
+        "prior": lambda: Scores(alone, width, rngs) if space.points else jax.random.normal(rngs(), (space.prior_outputs,)),
+        "discriminator": lambda: Reader(pair, [options.discriminator_width] * options.depth, 1, rngs),
+        "inference": lambda: Reader(pair, hidden, space.posterior_outputs, rngs),
     }
     return Networks(**{name: build() if name in parts | {"policy"} else None for name, build in builders.items()})

@@ -40,7 +40,7 @@ HOLD = 10  # frames for which the end of an episode stays
 def rollouts(run: Run, episodes: int, types: int, seed_index: int) -> tuple[Demonstration, Trajectory]:
     """Test demonstrations, and rollouts of the run's last checkpoint in each under `types` draws of its test types."""
     config = run.config
-    learner = config.learner(dataset.statistics(dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN)))
+    learner = config.learner(dataset.statistics(config.scene, dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN)))
     test = dataset.demonstrations(config.scene, config.experts.test, dataset.TEST)
     shown = jax.tree.map(lambda x: x[:episodes], test)
     _, state, _ = run.restore(start_shapes(learner, config.all_seeds))

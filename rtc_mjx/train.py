@@ -44,7 +44,7 @@ def train(config: Config) -> Run:
 def learn(run: Run, config: Config) -> None:
     """The training loop."""
     expert = dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN)
-    learner = config.learner(dataset.statistics(expert))
+    learner = config.learner(dataset.statistics(config.scene, expert))
     state, update, before = begin(run, learner, config)
     test = Tests(config, learner)
     chunks, data = functools.cache(functools.partial(compiled_chunk, learner)), dataset.without_truth(expert)

@@ -42,7 +42,7 @@ def learner(method, *, weights=None, optimiser=OPEN, share=0.5, batch=12):
     held = METHODS[method]
     demonstrations = experts(jnp.zeros(0).dtype == jnp.float64)
     return Learner(
-        scene=SCENE, method=held, space=held.space(MODEL), statistics=dataset.statistics(demonstrations), model=MODEL,
+        scene=SCENE, method=held, space=held.space(MODEL), statistics=dataset.statistics(SCENE, demonstrations), model=MODEL,
         weights=weights or LossWeights(adversarial_ramp=0), optimiser=optimiser, updates=100, batch=batch, encoder_share=share,
     )  # fmt: skip
 

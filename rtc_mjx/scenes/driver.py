@@ -82,7 +82,9 @@ def steering(own: Array, route: Array, aside: Array) -> Float[Array, ""]:
     return jnp.clip(jnp.arctan(2 * WHEELBASE * target[1] / far**2), -0.6, 0.6)
 
 
-def pedals(own: Array, route: Array, signal: Float[Array, "3"], users: Float[Array, "users 10"], truth: dict[str, Array]) -> Float[Array, ""]:
+def pedals(
+    own: Array, route: Array, signal: Float[Array, "3"], users: Float[Array, "users 10"], truth: dict[str, Array]
+) -> Float[Array, ""]:
     """Acceleration in m/s^2."""
     speed = jnp.maximum(own[0], 0.0)
     stations, points = way_ahead(route)

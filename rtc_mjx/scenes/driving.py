@@ -32,6 +32,7 @@ CONTROL_EVERY = 3  # logged times a control step: 10 Hz to 3.3 Hz
 AHEAD = (2.0, 5.0, 8.0, 12.0, 16.0, 20.0, 25.0, 30.0, 40.0, 50.0)  # m along a route, where it is looked at
 FAR = 60.0  # m, beyond which nothing is told apart
 OFF_ROUTE = 5.0  # m to the side, beyond which a route is no longer one's own
+SAME_ROUTE = 0.05  # m, mean difference in distance from the path below which routes fit alike
 AWAY = 1e3  # m, where road users wait that are not there
 BINS = 100  # of the divergences (paper, section V-B)
 SAMPLES = 16  # K of minADE
@@ -110,7 +111,10 @@ class Driving(Scene):
         times = CONTROL_EVERY * jnp.arange(self.steps + 1)
         start, velocity = log.pose[log.controlled, 0], log.velocity[log.controlled, 0]
         kept, dropped = nearest_users(log, self.road_users)
-        pose, present = log.pose[kept][:, times].swapaxes(0, 1), log.valid[kept][:, times].swapaxes(0, 1) & (log.kind[kept] > 0) & (kept != log.controlled)
+        pose, present = (
+            log.pose[kept][:, times].swapaxes(0, 1),
+            log.valid[kept][:, times].swapaxes(0, 1) & (log.kind[kept] > 0) & (kept != log.controlled),
+        )
         away = jnp.stack([AWAY + 20.0 * jnp.arange(self.road_users), jnp.full(self.road_users, AWAY), jnp.zeros(self.road_users)], axis=1)
         heading = jnp.unwrap(pose[..., 2], axis=0)
         placed = jnp.where(present[..., None], pose.at[..., 2].set(heading), away)
@@ -151,14 +155,19 @@ class Driving(Scene):
         return jnp.where(touching | past, 0.0, jnp.max(jnp.where(episode.context.routes.valid, along, -jnp.inf)))
 
     def label(self, demonstration: Demonstration) -> Float[Array, "labels"]:
-        """The lane sequence that was driven (Symphony's type): the route nearest to the path over its second half."""
+        """The lane sequence that was driven (Symphony's type): the route nearest to the path over its second half.
+
+        Where the path ends before routes part, those that fit alike share the label.
+        """
         driven = demonstration.trajectory.states.qpos[self.steps // 2 :, :2]
         routes = demonstration.episode.context.routes
 
         def off(path: Array) -> Array:
             return jnp.mean(jax.vmap(lambda point: jnp.minimum(FAR, jnp.abs(project(path, SPACING, point)[1])))(driven))
 
-        return jax.nn.one_hot(jnp.argmin(jnp.where(routes.valid, jax.vmap(off)(routes.paths), jnp.inf)), self.labels)
+        distance = jnp.where(routes.valid, jax.vmap(off)(routes.paths), jnp.inf)
+        fits = (distance < jnp.min(distance) + SAME_ROUTE).astype(driven.dtype)
+        return fits / jnp.sum(fits)
 
     def discrepancy(self, demonstration: Demonstration, trajectory: Trajectory) -> Float[Array, ""]:
         """L_rec: the Huber distance (1 m) of the four corners of the car between demonstration and rollout, mean over corners and time."""

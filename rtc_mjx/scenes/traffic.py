@@ -133,7 +133,9 @@ def drive(drivers: Drivers, spacing: float, times: int) -> tuple[Float[Array, "t
 
     clock = TICK * jnp.arange(times)
     _, (station, speed) = lax.scan(tick, (drivers.station, drivers.speed), (clock, drivers.signals))
-    poses = jax.vmap(lambda path, s: jax.vmap(lambda one: pose_at(path, spacing, one))(s), in_axes=(0, 1), out_axes=1)(drivers.paths, station)
+    poses = jax.vmap(lambda path, s: jax.vmap(lambda one: pose_at(path, spacing, one))(s), in_axes=(0, 1), out_axes=1)(
+        drivers.paths, station
+    )
     return poses, speed
 
 
