@@ -73,7 +73,6 @@ class RayCamera:
         down = (height / 2 - np.arange(height) - 0.5) * 2 * half / height
         rays = np.stack([*np.meshgrid(across, down), np.full((height, width), -1.0)], axis=-1).reshape(-1, 3)
         self.rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        self.colours = _colours(model)
         self.hidden = _textures(model)
 
     def __call__(self, data: mujoco.MjData) -> Picture:
@@ -83,7 +82,7 @@ class RayCamera:
         ids, distances, normals = np.full(count, -1, np.int32), np.zeros(count), np.zeros(3 * count)
         place = data.cam_xpos[self.index]
         mujoco.mj_multiRay(self.model, data, place, rays.ravel(), self._groups(), 1, -1, ids, distances, normals, count, mujoco.mjMAXVAL)
-        colour = self.colours[ids]
+        colour = _colours(self.model)[ids]  # they may have changed since the last picture
         points = place + rays * distances[:, None]
         for geom, (first, second, size) in self.hidden.items():
             seen = ids == geom

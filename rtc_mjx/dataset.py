@@ -86,7 +86,7 @@ def statistics(scene: Scene, expert: Demonstration) -> Statistics:
         moments.append((np.tile(mean, held.count), np.tile(scale, held.count)))
         first = last
     observed = (np.concatenate(x) for x in zip(*moments, strict=True))
-    done = _moments(expert.trajectory.actions)
+    done = _moments(np.asarray(expert.trajectory.actions))
     return Statistics(*(jnp.asarray(x, jnp.float32) for x in (*observed, *done)))
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
-from rtc_mjx.scenes import ItemSet
+from rtc_mjx.scenes import ItemSet, split_items
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,7 @@ class Layout:
 
     def parts(self, x: Float[Array, "*batch inputs"]) -> tuple[Float[Array, "*batch plain"], list[Array]]:
         """The plain numbers, and the items (..., count, size) of each set."""
-        items, first = [], self.own
-        for held in self.sets:
-            last = first + held.count * held.size
-            items.append(x[..., first:last].reshape(*x.shape[:-1], held.count, held.size))
-            first = last
-        return jnp.concatenate([x[..., : self.own], x[..., first:]], axis=-1), items
+        return split_items(self.sets, self.own, x)
 
 
 def linear(inputs: int, outputs: int, rngs: nnx.Rngs, scale: float = 1.0) -> nnx.Linear:

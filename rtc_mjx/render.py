@@ -28,7 +28,8 @@ from rtc_mjx.keys import stream
 from rtc_mjx.learner import start_shapes
 from rtc_mjx.physics import World, place_surroundings
 from rtc_mjx.runs import Run
-from rtc_mjx.trajectory import Demonstration, Trajectory
+from rtc_mjx.scenes import Scene
+from rtc_mjx.trajectory import Demonstration, Episode, Trajectory
 
 PALETTE = ((0.93, 0.55, 0.15), (0.26, 0.62, 0.85), (0.62, 0.43, 0.80), (0.90, 0.76, 0.20), (0.42, 0.75, 0.42), (0.88, 0.45, 0.60))
 EXPERT = (0.96, 0.96, 0.96)
@@ -56,26 +57,33 @@ def rollouts(run: Run, episodes: int, types: int, seed_index: int) -> tuple[Demo
     return shown, jax.device_get(jax.jit(jax.vmap(inner))(dataset.without_truth(shown), keys))
 
 
-def stage(world: World, body: str, actors: int, marks: int, size: tuple[int, int]) -> mujoco.MjModel:
-    """The world with a copy of the agent's body for each actor but the first, and marks for everyone's trail."""
-    spec = world.spec.copy()
+def stage(scene: Scene, episode: Episode, actors: int, ghosts: bool, marks: int, size: tuple[int, int]) -> mujoco.MjModel:
+    """The dressed world with marks for everyone's trail, and a copy of the agent's body for each actor but the first if `ghosts`."""
+    spec = scene.world.spec.copy()
     spec.visual.global_.offheight, spec.visual.global_.offwidth = size  # of what OpenGL draws into
-    original = spec.body(body)
-    colours = [EXPERT, *(PALETTE[i % len(PALETTE)] for i in range(actors - 1))]
-    for geom in original.geoms:
-        geom.material, geom.rgba = "", [*colours[0], 1]
+    scene.dress(spec, episode)
+    original = spec.body(scene.agent_body)
+    for geom in [g for g in original.geoms if not scene.side_by_side or g.name.endswith("/body")]:
+        geom.material, geom.rgba = "", [*EXPERT, 1]
     for actor in range(actors):
-        if actor:
+        if actor and ghosts:
             ghost = spec.worldbody.add_body(name=f"ghost{actor}", mocap=True)
             for g in original.geoms:
                 ghost.add_geom(
-                    type=g.type, size=g.size, pos=g.pos, quat=g.quat, group=g.group, rgba=[*colours[actor], 1], contype=0, conaffinity=0
+                    type=g.type, size=g.size, pos=g.pos, quat=g.quat, group=g.group, rgba=[*colour(actor), 1], contype=0, conaffinity=0
                 )
         for mark in range(marks):
             dot = spec.worldbody.add_body(name=f"mark{actor}_{mark}", mocap=True, pos=[0, 0, AWAY])
-            radius = [0.018 if actor else 0.013] * 3
-            dot.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=radius, rgba=[*colours[actor], 1], contype=0, conaffinity=0)
+            dot.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[scene.mark_size * (1.0 if actor else 0.7)] * 3, rgba=[*colour(actor), 1],
+                contype=0, conaffinity=0,
+            )  # fmt: skip
     return spec.compile()
+
+
+def colour(actor: int) -> tuple[float, float, float]:
+    """White for the expert (actor 0), one of the palette for each type."""
+    return PALETTE[(actor - 1) % len(PALETTE)] if actor else EXPERT
 
 
 def poses(world: World, body: str, qpos: np.ndarray) -> tuple[Float[np.ndarray, "times 3"], Float[np.ndarray, "times 4"]]:
@@ -91,34 +99,52 @@ def poses(world: World, body: str, qpos: np.ndarray) -> tuple[Float[np.ndarray, 
 
 
 def pictures(run: Run, shown: Demonstration, tracks: Trajectory, camera_name: str, size: tuple[int, int]) -> Iterator[Picture]:
-    """Every picture of the video, episode after episode."""
+    """Every picture of the video, episode after episode; where a scene is shown side by side, the expert first, then type by type."""
     scene = run.config.scene
-    world, body = scene.world, scene.agent_body
     actors, marks = tracks.actions.shape[1] + 1, scene.steps // EVERY + 1
-    model = stage(world, body, actors, marks, size)
-    data, take = mujoco.MjData(model), None
-    for episode in range(tracks.actions.shape[0]):
-        expert = shown.trajectory.states.qpos[episode]
-        paths = [poses(world, body, q) for q in (expert, *tracks.states.qpos[episode])]
-        around = shown.episode.surroundings.pose[episode]
+    for index in range(tracks.actions.shape[0]):
+        episode = jax.tree.map(lambda x, i=index: np.asarray(x[i]), shown.episode)
+        driven = [np.asarray(shown.trajectory.states.qpos[index]), *np.asarray(tracks.states.qpos[index])]
+        paths = [poses(scene.world, scene.agent_body, qpos) for qpos in driven]
+        model = stage(scene, episode, 2 if scene.side_by_side else actors, not scene.side_by_side, marks, size)
+        data, take = mujoco.MjData(model), camera(model, camera_name, *size)
         for time in range(scene.steps + 1):
-            _place(model, data, np.asarray(expert[time]), np.asarray(around[time]), paths, time, marks)
-            take = take or camera(model, camera_name, *size)
-            picture = take(data)
+            scene.paint(model, episode, time)
+            around = episode.surroundings.pose[time]
+            if scene.side_by_side:
+                shots = []
+                for actor in range(actors):
+                    paint_agent(model, scene.agent_body, marks, actor)
+                    _place(model, data, driven[actor][time], around, [paths[0], paths[actor]], time, marks, ghosts=False)
+                    shots.append(take(data))
+                picture = np.concatenate(shots, axis=1)
+            else:
+                _place(model, data, driven[0][time], around, paths, time, marks, ghosts=True)
+                picture = take(data)
             for _ in range(HOLD if time == scene.steps else 1):
                 yield picture
 
 
+def paint_agent(model: mujoco.MjModel, body: str, marks: int, actor: int) -> None:
+    """Gives the agent's body and its own trail the colour of an actor."""
+    first, count = model.body(body).geomadr[0], model.body(body).geomnum[0]
+    for geom in range(first, first + count):
+        if model.geom(geom).name.endswith("/body"):
+            model.geom_rgba[geom, :3] = colour(actor)
+    for mark in range(marks):
+        model.geom_rgba[model.body(f"mark1_{mark}").geomadr[0], :3] = colour(actor)
+
+
 def _place(
     model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray, around: np.ndarray, paths: Sequence[tuple[np.ndarray, np.ndarray]],
-    time: int, marks: int,
+    time: int, marks: int, ghosts: bool,
 ) -> None:  # fmt: skip
     """Puts everything where it is at a time."""
     data.qpos[:] = qpos
     place_surroundings(data, around)
     index = len(around)
     for actor, (places, turns) in enumerate(paths):
-        if actor:
+        if actor and ghosts:
             data.mocap_pos[index], data.mocap_quat[index] = places[time], turns[time]
             index += 1
         for mark in range(marks):
@@ -164,16 +190,28 @@ def main(argv: Sequence[str] | None = None) -> None:
             raise UsageError(f"--{name} {getattr(options, name)}: at least {least} is needed")
     if not 0 <= options.seed < run.config.seeds:
         raise UsageError(f"--seed {options.seed}: the run has seeds 0 to {run.config.seeds - 1}")
-    cameras = [c.name for c in run.config.scene.world.spec.cameras]
-    if options.camera not in cameras:
-        raise UsageError(f"--camera {options.camera}: no such camera; there are {', '.join(cameras)}")
+    view = full_name(run.config.scene, options.camera)
     logging.basicConfig(format="%(message)s")
     cache.keep_compiled()
     shown, tracks = rollouts(run, options.episodes, options.types, options.seed)
+    whole = (size[0], size[1] * (tracks.actions.shape[1] + 1)) if run.config.scene.side_by_side else size
     rate = 1 / (run.config.scene.substeps * run.config.scene.world.timestep)
     total = len(tracks.actions) * (run.config.scene.steps + HOLD)
-    count = write(pictures(run, shown, tracks, options.camera, size), out, size, rate, total)
+    count = write(pictures(run, shown, tracks, view, size), out, whole, rate, total)
     Console().print(f"{out}: {count} frames of {len(tracks.actions)} episodes")
+
+
+def full_name(scene: Scene, wanted: str) -> str:
+    """The name of a camera; that of one of the agent's own may leave out the agent's prefix.
+
+    Raises:
+        UsageError: there is no such camera; the message lists those there are.
+    """
+    prefix = scene.agent_body.rpartition("/")[0]
+    cameras = {c.name.removeprefix(f"{prefix}/") if prefix else c.name: c.name for c in scene.world.spec.cameras}
+    if wanted not in cameras:
+        raise UsageError(f"--camera {wanted}: no such camera; there are {', '.join(cameras)}")
+    return cameras[wanted]
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -1,7 +1,7 @@
 """Scenes: what happens in a world. Adding one takes a file here, an MJCF file if the world is new, and a line in `SCENES`."""
 
 from rtc_mjx.errors import UsageError
-from rtc_mjx.scenes.base import Actor, ItemSet, Scene
+from rtc_mjx.scenes.base import Actor, ItemSet, Scene, split_items
 from rtc_mjx.scenes.double_goal import DoubleGoal
 from rtc_mjx.scenes.intersection import Intersection
 
@@ -19,4 +19,4 @@ def scene_type(name: str) -> type[Scene]:
     return SCENES[name]
 
 
-__all__ = ["SCENES", "Actor", "DoubleGoal", "Intersection", "ItemSet", "Scene", "scene_type"]
+__all__ = ["SCENES", "Actor", "DoubleGoal", "Intersection", "ItemSet", "Scene", "scene_type", "split_items"]

@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import jax
+import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -50,6 +52,16 @@ class ItemSet:
     size: int
 
 
+def split_items(sets: tuple[ItemSet, ...], own: int, x: Float[Array, "*batch numbers"]) -> tuple[Array, list[Array]]:
+    """A vector of `own` plain numbers, the items of each set, and more plain numbers: all plain ones; the items (..., count, size)."""
+    items, first = [], own
+    for held in sets:
+        last = first + held.count * held.size
+        items.append(x[..., first:last].reshape(*x.shape[:-1], held.count, held.size))
+        first = last
+    return jnp.concatenate([x[..., :own], x[..., first:]], axis=-1), items
+
+
 @dataclass(frozen=True)
 class Scene(abc.ABC):
     """Base of all scenes; subclasses add their settings as fields.
@@ -63,6 +75,8 @@ class Scene(abc.ABC):
     main_metrics: ClassVar[tuple[str, ...]] = ()
     agent_body: ClassVar[str] = "agent"
     samples: ClassVar[int] = 1  # rollouts of each test episode, every one with a type of its own
+    mark_size: ClassVar[float] = 0.018  # m, radius of the marks that trails are made of in videos
+    side_by_side: ClassVar[bool] = False  # whether a video shows each rollout in a picture of its own
     reconstructs_rollouts: ClassVar[bool] = False  # whether L_rec compares rollouts (`discrepancy`) rather than actions
     steps: int = field(default=60)
 
@@ -85,6 +99,14 @@ class Scene(abc.ABC):
     def control_range(self) -> Float[np.ndarray, "controls 2"]:
         """Lowest and highest value of each control."""
         return np.asarray(self.world.mj.actuator_ctrlrange[list(self.world.control_ids)])
+
+    def dress(self, spec: mujoco.MjSpec, episode: Episode) -> None:
+        """Adds to a world's specification what only pictures of an episode need; nothing unless a scene says so."""
+        return
+
+    def paint(self, model: mujoco.MjModel, episode: Episode, time: int) -> None:
+        """Makes a dressed model look as it does at a control step of an episode; as it is unless a scene says so."""
+        return
 
     @abc.abstractmethod
     def reset(self, key: jax.Array) -> Episode:

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from jax import random
 from jaxtyping import Array, Float
 
-from rtc_mjx.scenes.base import Actor
-from rtc_mjx.scenes.driving import AHEAD, CAR, split
+from rtc_mjx.scenes.base import Actor, split_items
+from rtc_mjx.scenes.driving import AHEAD, CAR, OWN
 from rtc_mjx.scenes.traffic import COMFORT, GRIP, follow_the_leader
 from rtc_mjx.trajectory import Episode
 
@@ -51,8 +51,8 @@ def expert_driver(key: jax.Array, scene: "Driving", episode: Episode, speeds: tu
     tremor = random.normal(next(keys), (scene.steps, 2)) * jnp.array([0.12, 0.006])
 
     def act(memory: Array, observation: Array, noise: Array) -> tuple[Array, Array]:
-        own, items = split(scene, observation)
-        route, users = items["routes"][truth["route"]], items["road_users"]
+        own, (routes, users) = split_items(scene.sets, OWN, observation)
+        route = routes[truth["route"]]
         seen = jnp.where(jnp.all(memory < 0), route[5:8], memory)  # at t = 0 nothing was seen before
         memory = jnp.concatenate([route[None, 5:8], seen[:-1]])
         pull = pedals(own, route, memory[truth["late"]], users, truth)
@@ -96,8 +96,9 @@ def pedals(
     asked.append(jnp.where(stops, follow_the_leader(speed, wanted, line + 1.2, speed, headway=truth["headway"] / 2), 9.0))
     grid = jnp.array(GRID)
     way = at(stations, points, grid)
-    tangent = jnp.gradient(way, axis=0)
-    tangent /= jnp.sqrt(jnp.sum(tangent**2, axis=1, keepdims=True) + 1e-9)
+    step = jnp.diff(way, axis=0)
+    tangent = jnp.concatenate([step, step[-1:]])
+    tangent = tangent / jnp.sqrt(jnp.sum(tangent**2, axis=1, keepdims=True) + 1e-9)
     gap, closing = ahead_of_me(way, tangent, grid, users, speed)
     asked.append(jnp.min(follow_the_leader(speed, wanted, gap, closing, headway=truth["headway"])))
     clash = first_clash(way, grid, users, speed, route, truth["gap"])

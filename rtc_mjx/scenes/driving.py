@@ -14,6 +14,7 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -23,12 +24,14 @@ from rtc_mjx.geometry import boxes_overlap, capsule_gap, corners, curvature, off
 from rtc_mjx.logs import AMBER, GREEN, PEDESTRIAN, RED, LoggedScene, RoadGraph
 from rtc_mjx.physics import PhysicsState, Surroundings, World, load, rest_state, specialised_step, substates
 from rtc_mjx.pytree import pytree
+from rtc_mjx.scenes import scenery
 from rtc_mjx.scenes.base import ItemSet, Scene
 from rtc_mjx.scenes.routes import BEHIND, SPACING, RouteOptions, Routes, find_routes
 from rtc_mjx.trajectory import Demonstration, Episode, Trajectory
 
 CAR = (4.6, 1.9)  # m, length and width of the agent's car (assets/car.xml)
 CONTROL_EVERY = 3  # logged times a control step: 10 Hz to 3.3 Hz
+OWN = 4  # numbers of an observation about the car itself
 AHEAD = (2.0, 5.0, 8.0, 12.0, 16.0, 20.0, 25.0, 30.0, 40.0, 50.0)  # m along a route, where it is looked at
 FAR = 60.0  # m, beyond which nothing is told apart
 OFF_ROUTE = 5.0  # m to the side, beyond which a route is no longer one's own
@@ -80,6 +83,8 @@ class Driving(Scene):
     route_options: ClassVar[RouteOptions] = RouteOptions()
     samples: ClassVar[int] = SAMPLES
     reconstructs_rollouts: ClassVar[bool] = True
+    mark_size: ClassVar[float] = 0.3
+    side_by_side: ClassVar[bool] = True
     steps: int = 30
     road_users: int = 8
 
@@ -97,6 +102,14 @@ class Driving(Scene):
     def sets(self) -> tuple[ItemSet, ...]:
         """After the car itself: the routes, then the road users."""
         return (ItemSet("routes", self.route_options.count, 11 + 2 * len(AHEAD)), ItemSet("road_users", self.road_users, 10))
+
+    def dress(self, spec: mujoco.MjSpec, episode: Episode) -> None:
+        """Kerbs, lanes, crosswalks and stop lines."""
+        scenery.dress(spec, episode.context, np.asarray(episode.start.qpos[:2]))
+
+    def paint(self, model: mujoco.MjModel, episode: Episode, time: int) -> None:
+        """Signals, and the sizes of road users."""
+        scenery.paint(model, episode.context, np.asarray(episode.surroundings.size), time)
 
     @abc.abstractmethod
     def log(self, key: jax.Array) -> LoggedScene:
@@ -176,7 +189,7 @@ class Driving(Scene):
         return jnp.mean(jnp.where(off < 1, 0.5 * off**2, off - 0.5))
 
     def features(self, demonstration: Demonstration, trajectory: Trajectory) -> dict[str, Array]:
-        """Of one trajectory: collisions, time off the road, distance from the demonstration, progress, curvature where lanes branch, red lights."""
+        """Of one trajectory: collisions, time off the road, distance from the demonstration, progress, curvature where lanes branch, reds run."""
         episode = demonstration.episode
         road, qpos = episode.context, trajectory.states.qpos
         touch, overlap = self.encounters(episode, trajectory)
@@ -213,7 +226,7 @@ class Driving(Scene):
         return jnp.any(touch, axis=0), jnp.any(overlap, axis=0)
 
     def metrics(self, features: dict[str, np.ndarray], expert: dict[str, np.ndarray]) -> dict[str, float]:
-        """Over (samples, episodes): rates, minADE in m over the samples, divergences in bits; bins span the range of the expert's values."""
+        """Over (samples, episodes): rates, minADE in m over the samples, divergences in bits; bins span the range of the expert's."""
         here, there = (_on_branches(f) for f in (features, expert))
         return {
             "collision_rate": float(np.mean(features["collision"])),
@@ -224,17 +237,6 @@ class Driving(Scene):
             "progress_jsd": metrics.jsd(features["progress"], expert["progress"], bins=BINS, limits=span(expert["progress"])),
             "ran_red_rate": float(np.mean(features["ran_red"])),
         }
-
-
-def split(scene: Scene, observation: Float[Array, "*batch features"]) -> tuple[Array, dict[str, Array]]:
-    """What an observation says of the agent itself, and its sets of items (..., count, size) by name."""
-    own = observation.shape[-1] - sum(s.count * s.size for s in scene.sets)
-    first, items = own, {}
-    for held in scene.sets:
-        last = first + held.count * held.size
-        items[held.name] = observation[..., first:last].reshape(*observation.shape[:-1], held.count, held.size)
-        first = last
-    return observation[..., :own], items
 
 
 def span(values: np.ndarray) -> tuple[float, float]:
