@@ -33,7 +33,7 @@ class ModelOptions:
         mixture: components of the policy's Gaussian mixture.
         choice_gradient: whether what a rollout loses moves the weights of the mixture, by the biased straight-through estimator;
             if not, likelihood alone decides how often each component is chosen.
-        smallest_scale: lower bound of the policy's standard deviation, in units of the control.
+        smallest_scale: lower bound of the policy's standard deviation, in the scene's units of the controls.
         type_size: dimension of a continuous type.
         type_count: number of discrete types.
         prior_components: of the continuous prior.
@@ -129,9 +129,10 @@ class Agent:
         return self.networks.policy(jnp.concatenate(flat, axis=-1))
 
     def action_distribution(self, outputs: Array) -> GaussianMixture:
-        """pi(a|s,g) from the policy's outputs: a mixture of Gaussians in the actuators' units."""
-        controls = self.statistics.action_mean.shape[-1]
-        return mixture_of(outputs, self.options.mixture, controls, self.options.smallest_scale)
+        """pi(a|s,g) from the policy's outputs, which are in the scene's units: a mixture of Gaussians in the actuators' units."""
+        unit = jnp.asarray(self.scene.control_unit, outputs.dtype)
+        held = mixture_of(outputs, self.options.mixture, len(unit), self.options.smallest_scale)
+        return GaussianMixture(held.logits, held.mean * unit, held.scale * unit)
 
     def posterior(self, trajectory: Trajectory) -> Distribution:
         """e(g|tau): reads all states and actions, the last state included."""

@@ -100,6 +100,11 @@ class Scene(abc.ABC):
         """Lowest and highest value of each control."""
         return np.asarray(self.world.mj.actuator_ctrlrange[list(self.world.control_ids)])
 
+    @property
+    def control_unit(self) -> Float[np.ndarray, "controls"]:
+        """A typical size of each control: what a policy puts out is in these units."""
+        return np.ones(len(self.world.control_ids))
+
     def dress(self, spec: mujoco.MjSpec, episode: Episode) -> None:
         """Adds to a world's specification what only pictures of an episode need; nothing unless a scene says so."""
         return

@@ -29,6 +29,7 @@ AFTER = tuple(0.4 * i for i in range(13))  # s ahead, to which others are expect
 WITHIN = {"vehicle": 2.1, "walker": 1.9}  # m from the middle of the way: ahead of me
 CROSSES = {"vehicle": 3.0, "walker": 2.4}  # m from the middle of the way: will be in it
 CANNOT_STOP = 7.5  # m/s^2: a line that takes harder braking is passed
+PASSED = -5.0  # m, behind a give-way line one no longer gives way
 LATEST = 4  # control steps by which a driver may see a signal change late
 ROUTES = (0.9, 1.1, 0.9)  # how often each is taken, where there are three
 
@@ -83,7 +84,7 @@ def steering(own: Array, route: Array, aside: Array) -> Float[Array, ""]:
 
 
 def pedals(
-    own: Array, route: Array, signal: Float[Array, "3"], users: Float[Array, "users 10"], truth: dict[str, Array]
+    own: Array, route: Array, signal: Float[Array, "3"], users: Float[Array, "users 11"], truth: dict[str, Array]
 ) -> Float[Array, ""]:
     """Acceleration in m/s^2."""
     speed = jnp.maximum(own[0], 0.0)
@@ -135,6 +136,15 @@ def ahead_of_me(way: Array, tangent: Array, grid: Array, users: Array, speed: Ar
     return jax.vmap(one)(users)
 
 
+def expected(velocity: Float[Array, "2"], yaw_rate: Array, after: Float[Array, "times"]) -> Float[Array, "times 2"]:
+    """Where somebody who keeps its speed and its rate of turning will be, from where it is, m."""
+    straight = jnp.abs(yaw_rate) < 0.02
+    rate = jnp.where(straight, 1.0, yaw_rate)
+    ahead, aside = jnp.sin(rate * after) / rate, (1 - jnp.cos(rate * after)) / rate
+    ahead, aside = jnp.where(straight, after, ahead), jnp.where(straight, 0.0, aside)
+    return ahead[:, None] * velocity + aside[:, None] * jnp.stack([-velocity[1], velocity[0]])
+
+
 def first_clash(way: Array, grid: Array, users: Array, speed: Array, route: Array, margin: Array) -> Float[Array, ""]:
     """M along the way to where somebody who goes first would cross it about when I am there; far if nobody would.
 
@@ -147,13 +157,14 @@ def first_clash(way: Array, grid: Array, users: Array, speed: Array, route: Arra
     def one(user: Array) -> Array:
         walks = user[9] > 0
         moving = jnp.sum(user[5:7] ** 2) > 0.25
-        spots = user[1:3] + after[:, None] * user[5:7]
+        spots = user[1:3] + expected(user[5:7], user[10], after)
         reach = jnp.where(walks, CROSSES["walker"], CROSSES["vehicle"])
         meets = jnp.sqrt(jnp.sum((way[:, None] - spots) ** 2, axis=-1)) < reach  # (grid, after)
         early, late = jnp.where(walks, 1.2, margin), jnp.where(walks, 1.0, 0.8)
         when = (after > mine[:, None] - late - 0.4) & (after < mine[:, None] + early)
         same_way = jnp.sum(user[5:7] * jnp.array([1.0, 0.0])) > 0.8 * jnp.sqrt(jnp.sum(user[5:7] ** 2) + 1e-6)
-        goes_first = walks | ((route[9] > 0) & ~same_way)
+        everybody = (route[9] > 1.5) & (route[8] > PASSED)
+        goes_first = walks | everybody | ((route[9] > 0.5) & (route[9] < 1.5) & ~same_way)
         clashes = jnp.any(meets & when, axis=1)
         return jnp.where((user[0] > 0) & moving & goes_first & jnp.any(clashes), grid[jnp.argmax(clashes)] - reach, 1e3)
 

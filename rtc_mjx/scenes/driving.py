@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rtc_mjx import metrics
 from rtc_mjx.geometry import boxes_overlap, capsule_gap, corners, curvature, off_road, pose_at, project, rotate, wrapped
-from rtc_mjx.logs import AMBER, GREEN, PEDESTRIAN, RED, LoggedScene, RoadGraph
+from rtc_mjx.logs import AMBER, GREEN, PEDESTRIAN, RATE, RED, LoggedScene, RoadGraph
 from rtc_mjx.physics import PhysicsState, Surroundings, World, load, rest_state, specialised_step, substates
 from rtc_mjx.pytree import pytree
 from rtc_mjx.scenes import scenery
@@ -50,6 +50,7 @@ class Road:
         signals: of each lane at each of the T+1 times.
         routes: the agent's ways on; `routes.signals` at the T+1 times.
         velocity: of the road users, m/s.
+        yaw_rate: of the road users, rad/s.
         kind: of each, as in `logs`; 0 for none.
         present: when each is there.
         ghosts: road users that overlap the agent at t = 0: they do not count as its collisions.
@@ -61,6 +62,7 @@ class Road:
     signals: Int[Array, "*batch times lanes"]
     routes: Routes
     velocity: Float[Array, "*batch times users 2"]
+    yaw_rate: Float[Array, "*batch times users"]
     kind: Int[Array, "*batch users"]
     present: Bool[Array, "*batch times users"]
     ghosts: Bool[Array, "*batch users"]
@@ -94,6 +96,11 @@ class Driving(Scene):
         return load("driving", road_users=self.road_users)
 
     @property
+    def control_unit(self) -> Float[np.ndarray, "controls"]:
+        """1.5 m/s^2 and 0.08 rad."""
+        return np.array([1.5, 0.08])
+
+    @property
     def labels(self) -> int:
         """Symphony's hand-made types: the routes."""
         return self.route_options.count
@@ -101,7 +108,7 @@ class Driving(Scene):
     @property
     def sets(self) -> tuple[ItemSet, ...]:
         """After the car itself: the routes, then the road users."""
-        return (ItemSet("routes", self.route_options.count, 11 + 2 * len(AHEAD)), ItemSet("road_users", self.road_users, 10))
+        return (ItemSet("routes", self.route_options.count, 11 + 2 * len(AHEAD)), ItemSet("road_users", self.road_users, 11))
 
     def dress(self, spec: mujoco.MjSpec, episode: Episode) -> None:
         """Kerbs, lanes, crosswalks and stop lines."""
@@ -139,6 +146,7 @@ class Driving(Scene):
             signals=log.signals[times],
             routes=dataclasses.replace(routes, signals=routes.signals[times]),
             velocity=log.velocity[kept][:, times].swapaxes(0, 1),
+            yaw_rate=jnp.where(present, jnp.gradient(heading, axis=0) * RATE / CONTROL_EVERY, 0.0),
             kind=log.kind[kept],
             present=present,
             ghosts=overlap & present[0],
@@ -155,7 +163,7 @@ class Driving(Scene):
         own = rotate(state.qvel[:2], -pose[2])
         routes = see_routes(road.routes, road.routes.signals[time], pose)
         around = jax.tree.map(lambda x: x[time], episode.surroundings)
-        users = see_users(around, road.velocity[time], road.present[time], road.kind, pose)
+        users = see_users(around, road.velocity[time], road.yaw_rate[time], road.present[time], road.kind, pose)
         return jnp.concatenate([own, state.qvel[2:3], state.qpos[3:4], routes.reshape(-1), users.reshape(-1)])
 
     def reward(self, episode: Episode, time: Array, state: PhysicsState) -> Float[Array, ""]:
@@ -189,7 +197,7 @@ class Driving(Scene):
         return jnp.mean(jnp.where(off < 1, 0.5 * off**2, off - 0.5))
 
     def features(self, demonstration: Demonstration, trajectory: Trajectory) -> dict[str, Array]:
-        """Of one trajectory: collisions, time off the road, distance from the demonstration, progress, curvature where lanes branch, reds run."""
+        """Of one trajectory: collisions, time off the road, distance from the expert, progress, curvature where lanes branch, reds run."""
         episode = demonstration.episode
         road, qpos = episode.context, trajectory.states.qpos
         touch, overlap = self.encounters(episode, trajectory)
@@ -293,16 +301,21 @@ def see_routes(routes: Routes, signals: Int[Array, "routes"], pose: Float[Array,
 
 
 def see_users(
-    around: Surroundings, velocity: Float[Array, "users 2"], present: Bool[Array, "users"], kind: Int[Array, "users"], pose: Array
-) -> Float[Array, "users 10"]:
-    """Each road user from a pose: 1 (there), x, y, cosine and sine of its heading, velocity, length, width, whether it walks."""
+    around: Surroundings,
+    velocity: Float[Array, "users 2"],
+    yaw_rate: Float[Array, "users"],
+    present: Bool[Array, "users"],
+    kind: Int[Array, "users"],
+    pose: Float[Array, "3"],
+) -> Float[Array, "users 11"]:
+    """Each road user from a pose: 1 (there), x, y, cosine and sine of its heading, velocity, length, width, whether it walks, yaw rate."""
     turned = jnp.broadcast_to(-pose[2], len(present))
     place = rotate(around.pose[:, :2] - pose[:2], turned)
     heading = around.pose[:, 2] - pose[2]
     there = present & (lax.stop_gradient(jnp.max(jnp.abs(place), axis=1)) < FAR)
     told = jnp.concatenate([
         place, jnp.cos(heading)[:, None], jnp.sin(heading)[:, None], rotate(velocity, turned), around.size,
-        1.0 * (kind == PEDESTRIAN)[:, None],
+        1.0 * (kind == PEDESTRIAN)[:, None], yaw_rate[:, None],
     ], axis=1)  # fmt: skip
     return jnp.concatenate([there[:, None].astype(told.dtype), jnp.where(there[:, None], told, 0.0)], axis=1)
 

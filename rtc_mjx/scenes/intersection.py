@@ -25,9 +25,9 @@ LANE_WIDTH = (3.3, 3.8)  # m
 CORNER = (7.0, 11.0)  # m, radius of a kerb
 ARM = 120.0  # m, from the junction's mouth outwards
 SETBACK = 5.5  # m, from the end of the kerb's bend to the stop line: the crosswalk lies between
-GREEN_FOR = (6.0, 14.0)  # s
+GREEN_FOR = (8.0, 16.0)  # s
 AMBER_FOR, ALL_RED = 3.0, 2.0  # s
-BACK = (8.0, 55.0)  # m, the agent's nose from its stop line at t = 0
+BACK = (4.0, 40.0)  # m, the agent's nose from its stop line at t = 0
 SPEED = (7.0, 13.0)  # m/s, what drivers want on a free road
 SOUTH, EAST, NORTH, WEST = 0, 1, 2, 3
 LEFT, STRAIGHT, RIGHT = 0, 1, 2
@@ -119,7 +119,7 @@ def approach(key: jax.Array, width: Array, corner: Array, signal: Array) -> tupl
     place, pace, aside = random.split(key, 3)
     back = random.uniform(place, minval=BACK[0], maxval=BACK[1])
     fastest = jnp.where(signal == GREEN, SPEED[1], jnp.sqrt(2 * 2.0 * jnp.maximum(0, back - 2)))
-    speed = random.uniform(pace, minval=0.3) * jnp.minimum(fastest, 11.0)
+    speed = random.uniform(pace, minval=0.5) * jnp.minimum(fastest, 11.0)
     x = width / 2 + 0.15 * random.normal(aside)
     return jnp.stack([x, -mouth(width, corner) - back - CAR[0] / 2, jnp.array(jnp.pi / 2)]), speed
 

@@ -5,7 +5,6 @@ controlled pose -> its lane -> successors, a few lanes deep -> one polyline a ro
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -139,4 +138,4 @@ def _one_route(scene: LoggedScene, lanes: Int[Array, "depth"], start: Pose, opti
     )
 
 
-_AXES: Any = Routes(**{field.name: 1 if field.name == "signals" else 0 for field in dataclasses.fields(Routes)})  # of routes among others
+_AXES = Routes(**{field.name: 1 if field.name == "signals" else 0 for field in dataclasses.fields(Routes)})  # type: ignore[arg-type]  # axes, not arrays
