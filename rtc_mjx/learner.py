@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int
 
 from rtc_mjx.agent_types import SOURCES, Typed, TypeSpace
 from rtc_mjx.keys import stream
-from rtc_mjx.losses import LOSSES, Case, LossWeights, gradient_penalty, read_rollouts
+from rtc_mjx.losses import CLOSED_LOOP, LOSSES, Case, LossWeights, gradient_penalty
 from rtc_mjx.methods import Branch, Method
 from rtc_mjx.models import Agent, ModelOptions, Networks, Statistics, make_networks
 from rtc_mjx.physics import OneStep
@@ -98,6 +98,10 @@ class Learner:
     def rows(self, branch: Branch) -> slice:
         """The rows of the minibatch that a branch takes."""
         return branch.rows(self.batch, self.encoder_share)
+
+    def losses(self, branch: Branch) -> tuple[str, ...]:
+        """The losses of a branch that the scene has."""
+        return tuple(name for name in branch.losses if name != "reconstruction" or self.scene.reconstructs_rollouts)
 
     def part(self, branch: Branch, batch: Demonstration) -> Demonstration:
         """A branch's rows of the minibatch."""
@@ -204,7 +208,7 @@ def gradients(learner: Learner, networks: Networks, batch: Demonstration, key: A
         alive = played.alive
 
         def by_rollouts(tracks: Trajectory) -> Array:
-            lost = branch_losses(learner, held, batch, now, Played(tracks, alive), extra, read_rollouts(learner.scene))
+            lost = branch_losses(learner, held, batch, now, Played(tracks, alive), extra, CLOSED_LOOP)
             return learner.weights.total(lost, update)
 
         cotangents, guarded = guard(
@@ -292,9 +296,9 @@ def branch_losses(
             part = jax.tree.map(lambda x, a=first, n=count: x[a : a + n], played)
             first += count
         cases = Case(mine, types, part.tracks, random.split(key, count))
-        for name in (n for n in branch.losses if n in names):
+        for name in (n for n in learner.losses(branch) if n in names):
             each = jax.vmap(lambda case, loss=LOSSES[name]: loss(agent, case, learner.weights))(cases)
-            sums[name] = sums.get(name, 0.0) + _mean(each, part.alive if name in read_rollouts(learner.scene) else jnp.ones(count, bool))
+            sums[name] = sums.get(name, 0.0) + _mean(each, part.alive if name in CLOSED_LOOP else jnp.ones(count, bool))
     return sums
 
 

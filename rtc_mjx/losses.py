@@ -17,7 +17,6 @@ from rtc_mjx import distributions
 from rtc_mjx.agent_types import Typed
 from rtc_mjx.models import Agent
 from rtc_mjx.pytree import pytree
-from rtc_mjx.scenes import Scene
 from rtc_mjx.trajectory import Demonstration
 
 KlDirection = Literal["posterior_prior", "prior_posterior"]
@@ -29,7 +28,7 @@ class LossWeights:
 
     Attributes:
         cloning: behaviour cloning on the demonstration.
-        reconstruction: the paper's L_rec.
+        reconstruction: the paper's L_rec by rollouts, where the scene has one.
         adversarial: the paper's lambda.
         adversarial_start: updates before lambda begins to rise; the discriminator learns from the first one on.
         adversarial_ramp: updates over which lambda then rises linearly from zero.
@@ -91,13 +90,12 @@ def cloning(agent: Agent, case: Case, weights: LossWeights) -> Array:
 
 
 def reconstruction(agent: Agent, case: Case, weights: LossWeights) -> Array:
-    """L_rec(tau, tau_hat) (paper, section V): the scene's distance between demonstration and rollout, where it has one.
+    """L_rec(tau, tau_hat) (paper, eq. 3): the scene's distance between a demonstration and the rollout under the type inferred from it.
 
-    Otherwise -mean_t log pi(a_t | s_t, g_e) on the demonstration's states.
+    Of methods with an encoder, beside cloning under the same type; only where the scene `reconstructs_rollouts`. On the double goal
+    the paper's L_rec is the cloning loss itself (section V-A).
     """
-    if agent.scene.reconstructs_rollouts:
-        return agent.scene.discrepancy(case.demonstration, case.rollout)
-    return cloning(agent, case, weights)
+    return agent.scene.discrepancy(case.demonstration, case.rollout)
 
 
 def adversarial(agent: Agent, case: Case, weights: LossWeights) -> Array:
@@ -134,12 +132,7 @@ LOSSES: dict[str, Loss] = {
     "type_info": type_info,
     "type_nll": type_nll,
 }
-CLOSED_LOOP = frozenset({"adversarial", "type_info"})  # losses that read the rollout ...
-
-
-def read_rollouts(scene: Scene) -> frozenset[str]:
-    """... in a scene: reconstruction does where the scene compares rollouts."""
-    return CLOSED_LOOP | ({"reconstruction"} if scene.reconstructs_rollouts else set())
+CLOSED_LOOP = frozenset({"adversarial", "type_info", "reconstruction"})  # losses that read the rollout
 
 
 def gradient_penalty(agent: Agent, observations: Array, actions: Array) -> Array:

@@ -80,7 +80,7 @@ class Method:
 
 
 CLONE, PLAY = ("cloning",), ("adversarial",)
-ENCODED = ("reconstruction", "type_kl", "adversarial")
+ENCODED = ("cloning", "reconstruction", "type_kl", "adversarial")
 
 BC = Method((Branch("none", CLONE),))
 MGAIL = Method((Branch("none", CLONE + PLAY),))

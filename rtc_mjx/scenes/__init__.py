@@ -4,8 +4,10 @@ from rtc_mjx.errors import UsageError
 from rtc_mjx.scenes.base import Actor, ItemSet, Scene, split_items
 from rtc_mjx.scenes.double_goal import DoubleGoal
 from rtc_mjx.scenes.intersection import Intersection
+from rtc_mjx.scenes.merge import Merge
+from rtc_mjx.scenes.roundabout import Roundabout
 
-SCENES: dict[str, type[Scene]] = {"double_goal": DoubleGoal, "intersection": Intersection}
+SCENES: dict[str, type[Scene]] = {"double_goal": DoubleGoal, "intersection": Intersection, "roundabout": Roundabout, "merge": Merge}
 
 
 def scene_type(name: str) -> type[Scene]:
@@ -19,4 +21,4 @@ def scene_type(name: str) -> type[Scene]:
     return SCENES[name]
 
 
-__all__ = ["SCENES", "Actor", "DoubleGoal", "Intersection", "ItemSet", "Scene", "scene_type", "split_items"]
+__all__ = ["SCENES", "Actor", "DoubleGoal", "Intersection", "ItemSet", "Merge", "Roundabout", "Scene", "scene_type", "split_items"]

@@ -128,7 +128,7 @@ class Driving(Scene):
 
     def episode(self, log: LoggedScene) -> Episode:
         """The agent where and as fast as it was logged at t = 0, the nearest road users as they were logged."""
-        times = CONTROL_EVERY * jnp.arange(self.steps + 1)
+        log, times = with_room_for(log, self.road_users), CONTROL_EVERY * jnp.arange(self.steps + 1)
         start, velocity = log.pose[log.controlled, 0], log.velocity[log.controlled, 0]
         kept, dropped = nearest_users(log, self.road_users)
         pose, present = (
@@ -137,6 +137,7 @@ class Driving(Scene):
         )
         away = jnp.stack([AWAY + 20.0 * jnp.arange(self.road_users), jnp.full(self.road_users, AWAY), jnp.zeros(self.road_users)], axis=1)
         heading = jnp.unwrap(pose[..., 2], axis=0)
+        turned = jnp.diff(heading, axis=0)
         placed = jnp.where(present[..., None], pose.at[..., 2].set(heading), away)
         size = jnp.broadcast_to(log.size[kept], (self.steps + 1, self.road_users, 2))
         routes = find_routes(log, start, self.route_options)
@@ -146,7 +147,7 @@ class Driving(Scene):
             signals=log.signals[times],
             routes=dataclasses.replace(routes, signals=routes.signals[times]),
             velocity=log.velocity[kept][:, times].swapaxes(0, 1),
-            yaw_rate=jnp.where(present, jnp.gradient(heading, axis=0) * RATE / CONTROL_EVERY, 0.0),
+            yaw_rate=jnp.where(present, jnp.concatenate([turned[:1], turned]) * RATE / CONTROL_EVERY, 0.0),
             kind=log.kind[kept],
             present=present,
             ghosts=overlap & present[0],
@@ -255,6 +256,18 @@ def span(values: np.ndarray) -> tuple[float, float]:
 
 def _on_branches(features: dict[str, np.ndarray]) -> np.ndarray:
     return features["curvature"][features["branching"].astype(bool)]
+
+
+def with_room_for(log: LoggedScene, count: int) -> LoggedScene:
+    """The same scene with entries enough for as many road users beside the agent; those added are of no kind."""
+    more = max(0, count + 1 - log.kind.shape[0])
+
+    def longer(x: Array) -> Array:
+        return jnp.pad(x, [(0, more), *[(0, 0)] * (x.ndim - 1)])
+
+    return LoggedScene(
+        log.road, log.signals, longer(log.pose), longer(log.velocity), longer(log.size), longer(log.kind), longer(log.valid), log.controlled
+    )
 
 
 def nearest_users(log: LoggedScene, count: int) -> tuple[Int[Array, "count"], Int[Array, ""]]:

@@ -17,6 +17,7 @@ from rtc_mjx.logs import AMBER, GREEN, NO_SIGNAL, PEDESTRIAN, RATE, RED, VEHICLE
 from rtc_mjx.scenes.base import Actor
 from rtc_mjx.scenes.driver import expert_driver
 from rtc_mjx.scenes.driving import CAR, CONTROL_EVERY, Driving
+from rtc_mjx.scenes.generated import assemble, moving
 from rtc_mjx.scenes.roads import POINTS, arc, ring_edges, straight
 from rtc_mjx.scenes.traffic import Drivers, Walkers, drive, walk
 from rtc_mjx.trajectory import Episode
@@ -154,30 +155,23 @@ def traffic(
     start = start.at[0].set(jnp.minimum(start[0], speed + 2)).at[3].set(jnp.minimum(start[3], start[2] + 1))
     slowest = jnp.sqrt(jnp.maximum(0.0, speed**2 - 2 * 2.5 * (gaps[0] - 3)))  # the agent can follow it without an emergency
     start = start.at[0].max(slowest)
+    present, leaders = random.bernoulli(next(keys), jnp.array(PRESENT)), jnp.array([1, -1, -1, 2, -1, -1])
     hard = random.bernoulli(next(keys), BRAKES_HARD, (6,)) & (jnp.arange(6) < 2)
     drivers = Drivers(
         paths=paths, station=station, speed=start, desired=desired, headway=random.uniform(next(keys), (6,), minval=1.0, maxval=1.8),
-        length=length, leader=jnp.array([1, -1, -1, 2, -1, -1]),
+        length=length, leader=jnp.where(present[leaders], leaders, -1),  # nobody follows a vehicle that is not there
+
         until=jnp.where((ways == ways[jnp.array([1, 0, 3, 2, 4, 5])]), 1e3, nose + 4.0),
         stop=jnp.full(6, nose), signals=signals,
         brakes=jnp.where(hard, random.uniform(next(keys), (6,), minval=0.5, maxval=6.0), 1e3),
         brakes_for=random.uniform(next(keys), (6,), minval=0.6, maxval=1.8),
     )  # fmt: skip
-    present = random.bernoulli(next(keys), jnp.array(PRESENT))
-    drivers = _without_absent(drivers, present)
     poses, speeds = drive(drivers, spacing, times)
     people, pace, size, walking = _people(next(keys), width, corner, ahead, across, times)
     poses, speeds = jnp.concatenate([poses, people], axis=1), jnp.concatenate([speeds, pace], axis=1)
-    velocity = speeds[..., None] * jnp.stack([jnp.cos(poses[..., 2]), jnp.sin(poses[..., 2])], axis=-1)
     sizes = jnp.concatenate([jnp.stack([length, jnp.full(6, 1.9)], axis=1), size])
     kinds = jnp.concatenate([jnp.where(present, VEHICLE, 0), jnp.where(walking, PEDESTRIAN, 0)])
-    return poses.swapaxes(0, 1), velocity.swapaxes(0, 1), sizes, kinds, kinds > 0
-
-
-def _without_absent(drivers: Drivers, present: Array) -> Drivers:
-    """Nobody follows a vehicle that is not there."""
-    leads = jnp.where(present[drivers.leader] & (drivers.leader >= 0), drivers.leader, -1)
-    return Drivers(**vars(drivers) | {"leader": leads})
+    return moving(poses, speeds, sizes, kinds)
 
 
 def _people(key: jax.Array, width: Array, corner: Array, ahead: Array, across: Array, times: int) -> tuple[Array, Array, Array, Array]:
@@ -193,19 +187,3 @@ def _people(key: jax.Array, width: Array, corner: Array, ahead: Array, across: A
     ready = jnp.where(may_go[0], ready, jnp.maximum(ready, 0.0))
     poses, pace = walk(Walkers(start, goal, speed, ready, may_go), times)
     return poses, pace, jnp.full((2, 2), 0.6), random.bernoulli(next(keys), jnp.array(WALKING))
-
-
-def assemble(road: RoadGraph, signals: Array, pose: Array, speed: Array, others: tuple[Array, ...], times: int) -> LoggedScene:
-    """The logged scene, the agent first; it is there at t = 0 only: what it does then is for whoever drives it."""
-    poses, velocities, sizes, kinds, valid = others
-    heading = jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
-    return LoggedScene(
-        road=road,
-        signals=signals,
-        pose=jnp.concatenate([jnp.broadcast_to(pose, (1, times, 3)), poses]),
-        velocity=jnp.concatenate([jnp.broadcast_to(speed * heading, (1, times, 2)), velocities]),
-        size=jnp.concatenate([jnp.array([CAR]), sizes]),
-        kind=jnp.concatenate([jnp.array([VEHICLE]), kinds]),
-        valid=jnp.concatenate([(jnp.arange(times) == 0)[None], jnp.broadcast_to(valid[:, None], (len(valid), times))]),
-        controlled=jnp.array(0),
-    )

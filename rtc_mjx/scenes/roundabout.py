@@ -1,0 +1,141 @@
+"""A roundabout of four arms, generated: the agent comes from the south, gives way, and leaves by one of three exits.
+
+External, xi: who circulates and how fast. Internal to the expert: the exit, its speed, the gap it takes.
+"""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+from jax import random
+from jaxtyping import Array
+
+from rtc_mjx.geometry import resample, rotate
+from rtc_mjx.logs import NO_SIGNAL, VEHICLE, LoggedScene, RoadGraph
+from rtc_mjx.scenes.base import Actor
+from rtc_mjx.scenes.driver import expert_driver
+from rtc_mjx.scenes.driving import CAR, CONTROL_EVERY, Driving
+from rtc_mjx.scenes.generated import assemble, moving
+from rtc_mjx.scenes.roads import as_segments, beside, bezier, straight, thinned
+from rtc_mjx.scenes.routes import RouteOptions
+from rtc_mjx.scenes.traffic import Drivers, drive
+from rtc_mjx.trajectory import Episode
+
+WIDTH = 4.2  # m, of a lane
+RING = (15.0, 18.0)  # m, radius of the ring's centre line
+FLARE = 0.5  # rad, of the ring, between the middle of an arm and where its entry joins or its exit leaves
+MOUTH = 14.0  # m, from the ring's centre line outwards, where an arm begins to bend
+ARM = 100.0  # m
+KERB = 40  # pieces of a kerb between two arms
+BACK = (3.0, 35.0)  # m, the agent's nose from the give-way line at t = 0
+SPEED = (7.0, 11.0)  # m/s, what drivers want on a free road
+IN, ENTRY, SHORT, LONG, EXIT, OUT = range(6)  # lanes of an arm: in, onto the ring, to the next exit, past it to the next entry, off, out
+FROM = (3, 3, 3, 1, 2)  # arms that traffic comes from: nobody's way crosses another's
+PRESENT = (0.75, 0.65, 0.5, 0.6, 0.6)
+
+
+@dataclass(frozen=True)
+class Roundabout(Driving):
+    """Settings of the roundabout.
+
+    Attributes:
+        steps: T, the number of control steps of 0.3 s in an episode.
+        road_users: bodies for replayed road users; the nearest are kept.
+    """
+
+    name: ClassVar[str] = "roundabout"
+    route_options: ClassVar[RouteOptions] = RouteOptions(lanes=9)
+
+    def log(self, key: jax.Array) -> LoggedScene:
+        """Road and traffic; the agent itself at t = 0 only."""
+        shape, who, place, pace = random.split(key, 4)
+        times = CONTROL_EVERY * self.steps + 1
+        radius = random.uniform(shape, minval=RING[0], maxval=RING[1])
+        road = ring(radius)
+        back = random.uniform(place, minval=BACK[0], maxval=BACK[1])
+        speed = random.uniform(pace, minval=0.5) * jnp.minimum(8.0, jnp.sqrt(2 * 2.0 * back))
+        pose = jnp.stack([jnp.array(WIDTH / 2), -radius - MOUTH - back - CAR[0] / 2, jnp.array(jnp.pi / 2)])
+        signals = jnp.full((times, road.lanes.shape[0]), NO_SIGNAL)
+        return assemble(road, signals, pose, speed, traffic(who, road, times), times)
+
+    def expert(self, key: jax.Array, episode: Episode) -> tuple[Actor, Any]:
+        """A driver with an exit and a temper of its own."""
+        return expert_driver(key, self, episode, SPEED)
+
+
+def ring(radius: Array) -> RoadGraph:
+    """The road graph; arm 0 is the south, and arms follow each other the way that traffic circulates."""
+    half, mouth, quarter = WIDTH / 2, radius + MOUTH, jnp.pi / 2
+
+    def on_ring(bearing: Array) -> Array:
+        return radius * jnp.stack([jnp.cos(bearing), jnp.sin(bearing)])
+
+    def along(start: float, end: float) -> Array:
+        bearing = jnp.linspace(start, end, 24)
+        return radius * jnp.stack([jnp.cos(bearing), jnp.sin(bearing)], axis=1)
+
+    south = -quarter
+    joins, leaves = jnp.array(south + FLARE), jnp.array(south - FLARE)
+    lanes = [
+        straight(jnp.stack([jnp.array(half), -mouth - ARM]), jnp.stack([jnp.array(half), -mouth])),
+        bezier(jnp.stack([jnp.array(half), -mouth]), jnp.array(quarter), on_ring(joins), joins + quarter, 0.45 * MOUTH),
+        along(south + FLARE, south + quarter - FLARE),
+        along(south - FLARE, south + FLARE),
+        bezier(on_ring(leaves), leaves + quarter, jnp.stack([jnp.array(-half), -mouth]), jnp.array(-quarter), 0.45 * MOUTH),
+        straight(jnp.stack([jnp.array(-half), -mouth]), jnp.stack([jnp.array(-half), -mouth - ARM])),
+    ]
+    arm = jnp.stack(lanes)
+    every = jnp.concatenate([rotate(arm, jnp.array(k * quarter)) for k in range(4)])
+    successors = jnp.full((24, 2), -1)
+    for k in range(4):
+        after = 6 * ((k + 1) % 4)
+        links = {
+            IN: [6 * k + ENTRY],
+            ENTRY: [6 * k + SHORT],
+            SHORT: [after + EXIT, after + LONG],
+            LONG: [6 * k + SHORT],
+            EXIT: [6 * k + OUT],
+        }
+        for lane, ways in links.items():
+            for slot, way in enumerate(ways):
+                successors = successors.at[6 * k + lane, slot].set(way)
+    gives_way = jnp.tile(jnp.array([0, 2, 0, 0, 0, 0]), 4)
+    outside = jnp.concatenate([arm[IN], arm[ENTRY][1:], arm[SHORT][1:], *(rotate(arm[x], jnp.array(quarter))[1:] for x in (EXIT, OUT))])
+    kerb = beside(outside, jnp.array(-half))
+    kerb = as_segments(jnp.concatenate([kerb[:1], thinned(kerb[len(arm[IN]) - 1 : -len(arm[OUT]) + 1], KERB - 1), kerb[-1:]]))
+    bearing = jnp.linspace(2 * jnp.pi, 0, 33)  # clockwise: the road is outside the island
+    island = as_segments((radius - half - 0.6) * jnp.stack([jnp.cos(bearing), jnp.sin(bearing)], axis=1))
+    edges = jnp.concatenate([*(rotate(kerb, jnp.array(k * quarter)) for k in range(4)), island])
+    return RoadGraph(every, successors, gives_way, edges, jnp.ones(len(edges), bool), jnp.zeros((1, 4, 2)))
+
+
+def traffic(key: jax.Array, road: RoadGraph, times: int) -> tuple[Array, Array, Array, Array, Array]:
+    """Poses, velocities, sizes, kinds and presence of those who circulate: from the west past the agent's entry, and elsewhere."""
+    keys = iter(random.split(key, 6))
+    count, arms = len(FROM), jnp.array(FROM)
+
+    def way(arm: Array, longer: Array) -> Array:
+        """From an arm to the next exit, or to the one after."""
+        after, second = (arm + 1) % 4, (arm + 2) % 4
+        near = [6 * arm + IN, 6 * arm + ENTRY, 6 * arm + SHORT, 6 * after + EXIT, 6 * after + OUT]
+        far = [6 * arm + IN, 6 * arm + ENTRY, 6 * arm + SHORT, 6 * after + LONG, 6 * after + SHORT, 6 * second + EXIT, 6 * second + OUT]
+        short, long = (resample(jnp.concatenate([road.lanes[i] for i in x]), 2.0 * jnp.arange(140)) for x in (near, far))
+        return jnp.where(longer, long, short)
+
+    paths = jax.vmap(way)(arms, arms == 3)
+    length = random.uniform(next(keys), (count,), minval=4.0, maxval=5.2)
+    desired = random.uniform(next(keys), (count,), minval=SPEED[0], maxval=SPEED[1])
+    first = ARM + random.uniform(next(keys), (count,), minval=-30.0, maxval=30.0)
+    gaps = random.uniform(next(keys), (count,), minval=10.0, maxval=30.0)
+    station = first.at[1].set(first[0] - gaps[1]).at[2].set(first[0] - gaps[1] - gaps[2])
+    drivers = Drivers(
+        paths=paths, station=station, speed=jnp.full(count, 5.5), desired=desired,
+        headway=random.uniform(next(keys), (count,), minval=1.0, maxval=1.8), length=length, leader=jnp.array([-1, 0, 1, -1, -1]),
+        until=jnp.full(count, 1e3), stop=jnp.full(count, 1e4), signals=jnp.full((times, count), NO_SIGNAL),
+        brakes=jnp.full(count, 1e3), brakes_for=jnp.zeros(count),
+    )  # fmt: skip
+    present = random.bernoulli(next(keys), jnp.array(PRESENT))
+    poses, speeds = drive(drivers, 2.0, times)
+    sizes = jnp.stack([length, jnp.full(count, 1.9)], axis=1)
+    return moving(poses, speeds, sizes, jnp.where(present, VEHICLE, 0))
