@@ -29,6 +29,7 @@ AFTER = tuple(0.4 * i for i in range(13))  # s ahead, to which others are expect
 WITHIN = {"vehicle": 2.1, "walker": 1.9}  # m from the middle of the way: ahead of me
 CROSSES = {"vehicle": 3.0, "walker": 2.4}  # m from the middle of the way: will be in it
 CANNOT_STOP = 7.5  # m/s^2: a line that takes harder braking is passed
+ENTERED = 7.0  # m past a give-way line, where one is in everybody's way
 PASSED = -5.0  # m, behind a give-way line one no longer gives way
 LATEST = 4  # control steps by which a driver may see a signal change late
 ROUTES = (0.9, 1.1, 0.9)  # how often each is taken, where there are three
@@ -151,8 +152,17 @@ def first_clash(way: Array, grid: Array, users: Array, speed: Array, route: Arra
     People on foot always go first. Vehicles do where the route gives way, until it is clear of them.
     """
     mine = (-speed + jnp.sqrt(speed**2 + 2 * 1.5 * grid)) / 1.5
-    mine = jnp.maximum(mine, grid / 7.0)
+    mine = jnp.maximum(mine, grid / jnp.where(route[9] > 1.5, 4.5, 7.0))
     after = jnp.array(AFTER)
+    entry = jnp.argmin(jnp.abs(grid - (route[8] + ENTERED)))
+
+    def beats_me_there(user: Array) -> Array:
+        """Whether somebody whose way bends, so that straight on says little, heads for where I join and is there about when I am."""
+        away, pace = way[entry] - user[1:3], jnp.sqrt(jnp.sum(user[5:7] ** 2) + 1e-6)
+        far = jnp.sqrt(jnp.sum(away**2) + 1e-6)
+        heads_there = jnp.sum(away * user[5:7]) > 0.2 * far * pace
+        eta = far / pace
+        return heads_there & (eta > mine[entry] - 0.8) & (eta < mine[entry] + margin + 0.5)
 
     def one(user: Array) -> Array:
         walks = user[9] > 0
@@ -160,12 +170,13 @@ def first_clash(way: Array, grid: Array, users: Array, speed: Array, route: Arra
         spots = user[1:3] + expected(user[5:7], user[10], after)
         reach = jnp.where(walks, CROSSES["walker"], CROSSES["vehicle"])
         meets = jnp.sqrt(jnp.sum((way[:, None] - spots) ** 2, axis=-1)) < reach  # (grid, after)
-        early, late = jnp.where(walks, 1.2, margin), jnp.where(walks, 1.0, 0.8)
+        joins = route[9] > 1.5  # who joins a stream needs room to get up to its speed
+        early, late = jnp.where(walks, 1.2, margin + jnp.where(joins, 1.0, 0.0)), jnp.where(walks, 1.0, 0.8)
         when = (after > mine[:, None] - late - 0.4) & (after < mine[:, None] + early)
         same_way = jnp.sum(user[5:7] * jnp.array([1.0, 0.0])) > 0.8 * jnp.sqrt(jnp.sum(user[5:7] ** 2) + 1e-6)
         everybody = (route[9] > 1.5) & (route[8] > PASSED)
         goes_first = walks | everybody | ((route[9] > 0.5) & (route[9] < 1.5) & ~same_way)
-        clashes = jnp.any(meets & when, axis=1)
+        clashes = jnp.any(meets & when, axis=1) | (joins & beats_me_there(user) & (jnp.arange(len(grid)) == entry))
         return jnp.where((user[0] > 0) & moving & goes_first & jnp.any(clashes), grid[jnp.argmax(clashes)] - reach, 1e3)
 
     return jnp.min(jax.vmap(one)(users))

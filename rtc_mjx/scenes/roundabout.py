@@ -29,7 +29,8 @@ MOUTH = 14.0  # m, from the ring's centre line outwards, where an arm begins to 
 ARM = 100.0  # m
 KERB = 40  # pieces of a kerb between two arms
 BACK = (3.0, 35.0)  # m, the agent's nose from the give-way line at t = 0
-SPEED = (7.0, 11.0)  # m/s, what drivers want on a free road
+SPEED = (7.0, 11.0)  # m/s, what the agent's driver wants on a free road
+CIRCLING = (4.6, 5.6)  # m/s, what the others want: not faster than one who has just joined
 IN, ENTRY, SHORT, LONG, EXIT, OUT = range(6)  # lanes of an arm: in, onto the ring, to the next exit, past it to the next entry, off, out
 FROM = (3, 3, 3, 1, 2)  # arms that traffic comes from: nobody's way crosses another's
 PRESENT = (0.75, 0.65, 0.5, 0.6, 0.6)
@@ -125,12 +126,12 @@ def traffic(key: jax.Array, road: RoadGraph, times: int) -> tuple[Array, Array, 
 
     paths = jax.vmap(way)(arms, arms == 3)
     length = random.uniform(next(keys), (count,), minval=4.0, maxval=5.2)
-    desired = random.uniform(next(keys), (count,), minval=SPEED[0], maxval=SPEED[1])
+    desired = random.uniform(next(keys), (count,), minval=CIRCLING[0], maxval=CIRCLING[1])
     first = ARM + random.uniform(next(keys), (count,), minval=-30.0, maxval=30.0)
     gaps = random.uniform(next(keys), (count,), minval=10.0, maxval=30.0)
     station = first.at[1].set(first[0] - gaps[1]).at[2].set(first[0] - gaps[1] - gaps[2])
     drivers = Drivers(
-        paths=paths, station=station, speed=jnp.full(count, 5.5), desired=desired,
+        paths=paths, station=station, speed=desired, desired=desired,
         headway=random.uniform(next(keys), (count,), minval=1.0, maxval=1.8), length=length, leader=jnp.array([-1, 0, 1, -1, -1]),
         until=jnp.full(count, 1e3), stop=jnp.full(count, 1e4), signals=jnp.full((times, count), NO_SIGNAL),
         brakes=jnp.full(count, 1e3), brakes_for=jnp.zeros(count),
