@@ -31,7 +31,7 @@ from rich.table import Table
 from rtc_mjx import cache, cli, config, dataset, pile_up
 from rtc_mjx.errors import UsageError
 from rtc_mjx.learner import compiled_chunk, start_all
-from rtc_mjx.physics import PhysicsState, Surroundings, World, load, rest_state, rest_surroundings, simulate, specialised_step
+from rtc_mjx.physics import OneStep, PhysicsState, Surroundings, World, load, rest_state, rest_surroundings, simulate, specialised_step
 
 WORLDS: dict[str, Callable[[], World]] = {
     "point_mass": lambda: load("double_goal"),
@@ -42,6 +42,7 @@ VARIANTS = ("native", "plain", "specialised", "handwritten")
 DIRECTIONS = ("forward", "gradient")
 BATCHES = (16, 64, 256, 1024, 4096)
 PARTS = ("physics", "pile_up", "update")
+UPDATED = {"double_goal": (1, 8), "intersection": (1,)}  # scenes whose updates are timed, and for how many seeds
 UPDATES = 10  # training updates of a timed sample
 STEPS = 32  # physics steps of a rollout
 SAMPLE_SECONDS = 0.05  # how long one timed sample lasts at least
@@ -186,20 +187,33 @@ def _seconds(function: Callable[..., Array], inputs: Inputs, calls: int) -> floa
     return (time.perf_counter() - start) / calls
 
 
-def updates(method: str, rounds: int, seed_counts: Sequence[int] = (1, 8)) -> list[dict[str, object]]:
-    """Milliseconds an update of a method on the double goal takes, on MJX and on a hand-written point mass, for numbers of seeds."""
-    settings = config.defaults("double_goal", method)
+def by_hand(world: World) -> OneStep:
+    """The same step by hand-written equations, without contacts: a damped point mass, or a kinematic bicycle about its middle."""
+    h = world.timestep
+
+    def point_mass(state: PhysicsState, force: Array, around: Surroundings) -> PhysicsState:
+        velocity = (state.qvel + h * 6.0 * jnp.clip(force, -1, 1)) / (1 + 2.0 * h)
+        return PhysicsState(state.qpos + h * velocity, velocity, state.warmstart)
+
+    def bicycle(state: PhysicsState, control: Array, around: Surroundings) -> PhysicsState:
+        heading, steer = state.qpos[2], jnp.clip(control[1], -0.6, 0.6)
+        speed = jnp.cos(heading) * state.qvel[0] + jnp.sin(heading) * state.qvel[1]
+        speed = jnp.maximum(0.0, speed + h * jnp.clip(control[0], -8.829, 4))
+        course = heading + jnp.arctan(0.5 * jnp.tan(steer))
+        qvel = jnp.stack([speed * jnp.cos(course), speed * jnp.sin(course), speed * jnp.tan(steer) / WHEELBASE, jnp.zeros(())])
+        return PhysicsState((state.qpos + h * qvel).at[3].set(steer), qvel, state.warmstart)
+
+    return point_mass if world.mj.nv == 2 else bicycle
+
+
+def updates(scene: str, method: str, rounds: int, seed_counts: Sequence[int]) -> list[dict[str, object]]:
+    """Milliseconds an update of a method takes, on MJX and on hand-written equations, for numbers of seeds."""
+    settings = config.defaults(scene, method)
     expert = dataset.demonstrations(settings.scene, 1024, dataset.TRAIN)
     learner, data = settings.learner(dataset.statistics(settings.scene, expert)), dataset.without_truth(expert)
-    timestep = settings.scene.world.timestep
-
-    def by_hand(state: PhysicsState, force: Array, around: Surroundings) -> PhysicsState:
-        velocity = (state.qvel + timestep * 6.0 * jnp.clip(force, -1, 1)) / (1 + 2.0 * timestep)
-        return PhysicsState(state.qpos + timestep * velocity, velocity, state.warmstart)
-
     running = {}
     for physics, count in ((p, n) for p in ("mjx", "handwritten") for n in seed_counts):
-        chosen = dataclasses.replace(learner, one_step=by_hand if physics == "handwritten" else None)
+        chosen = dataclasses.replace(learner, one_step=by_hand(settings.scene.world) if physics == "handwritten" else None)
         state = start_all(chosen, range(count))
         program = compiled_chunk(chosen, UPDATES).lower(state, data).compile()
         running[physics, count] = (program, program(state, data)[0])
@@ -210,7 +224,7 @@ def updates(method: str, rounds: int, seed_counts: Sequence[int] = (1, 8)) -> li
             running[key] = (program, jax.block_until_ready(program(state, data)[0]))
             times[key].append(time.perf_counter() - begin)
     return [
-        {"scene": "double_goal", "method": method, "physics": physics, "seeds": count, "ms": 1e3 * float(np.median(spent)) / UPDATES}
+        {"scene": scene, "method": method, "physics": physics, "seeds": count, "ms": 1e3 * float(np.median(spent)) / UPDATES}
         for (physics, count), spent in times.items()
     ]
 
@@ -339,8 +353,10 @@ def main(argv: Sequence[str] | None = None) -> None:
         report["pile_up"] = pile_up.compare()
         console.print(pile_up.table(report["pile_up"]))
     if "update" in parts:
-        report["update"] = updates("rtc_c", rounds)
-        console.print(updates_table(report["update"]))
+        for scene, seed_counts in UPDATED.items():
+            timed = updates(scene, "rtc_c", rounds, seed_counts)
+            report["update"] += timed
+            console.print(updates_table(timed))
     if not options.quick and "physics" in parts:
         report["warm_first_result_s"] = {name: first_result_seconds(name) for name in names}
         for name, seconds in report["warm_first_result_s"].items():

@@ -31,23 +31,20 @@ def rollout(
         scene: where.
         actor: who, with the noise of all T steps.
         episode: s_0 and xi.
-        gradient: what a backward pass follows from step to step: everything ('full'), the physics but not what the actor
-            saw ('dynamics_only'), or nothing ('none'). Values are the same.
+        gradient: what a backward pass follows from step to step: everything ('full'), the physics but not how the actor
+            reacts to what it sees ('dynamics_only'), or nothing ('none'). The observations that the trajectory holds can be
+            differentiated by the states in all modes: a discriminator tells how to reach better ones. Values are the same.
         decay: the backward signal shrinks by this factor at every step back in time; values are the same.
         one_step: physics in place of the scene's own, such as hand-written equations.
     """
     episode = jax.tree.map(jnp.asarray, episode)
     advance = control_step(scene.world, scene.substeps, one_step or specialised_step(scene.world))
 
-    def see(time: jax.Array, state: PhysicsState) -> jax.Array:
-        seen = scene.observe(episode, time, state)
-        return seen if gradient == "full" else lax.stop_gradient(seen)
-
     def body(carry, inputs):  # type: ignore[no-untyped-def]  # scan's carry is any pytree
         memory, state = carry
         time, before, after, noise = inputs
-        seen = see(time, state)
-        memory, action = actor.act(memory, seen, noise)
+        seen = scene.observe(episode, time, state)
+        memory, action = actor.act(memory, seen if gradient == "full" else lax.stop_gradient(seen), noise)
         reached = advance(damp(state, 0.0 if gradient == "none" else decay), action, before, after)
         return (memory, reached), (state, seen, action)
 
@@ -57,7 +54,7 @@ def rollout(
     before, after = (jax.tree.map(lambda x, part=part: x[part], episode.surroundings) for part in (slice(None, -1), slice(1, None)))
     inputs = (jnp.arange(scene.steps), before, after, actor.noise)
     (_, last), (states, seen, actions) = lax.scan(body, (actor.memory, episode.start), inputs)
-    end = see(jnp.array(scene.steps), last)
+    end = scene.observe(episode, jnp.array(scene.steps), last)
     states, seen = jax.tree.map(lambda xs, x: jnp.concatenate([xs, x[None]]), (states, seen), (last, end))
     return Trajectory(states, seen, actions)
 

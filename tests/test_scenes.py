@@ -1,5 +1,7 @@
 """Laws that every scene obeys, and those of the double goal problem. A new scene is tested by standing in SCENES."""
 
+import copy
+import dataclasses
 import functools
 
 import dm_env
@@ -16,7 +18,8 @@ from rtc_mjx import dataset
 from rtc_mjx.environment import Environment
 from rtc_mjx.errors import NonFiniteError, UsageError
 from rtc_mjx.rollout import rollout
-from rtc_mjx.scenes import SCENES, Actor, DoubleGoal, double_goal, scene_type
+from rtc_mjx.scenes import SCENES, Actor, DoubleGoal, double_goal, scene_type, split_items
+from rtc_mjx.trajectory import Demonstration
 
 
 @functools.cache
@@ -33,6 +36,9 @@ def experts(name, count=512):
 @pytest.fixture(params=SCENES)
 def scene(request):
     return made(request.param)
+
+
+SILENT = {"routes": (4, 5, 6, 7), "road_users": (9,)}
 
 
 def playback(scene, actions):
@@ -54,7 +60,23 @@ def test_an_episode_starts_where_reset_says(scene):
 def test_experts_are_finite_and_differ(scene):
     track = experts(scene.name).trajectory
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(track))
-    assert np.all(np.std(track.actions, axis=0) > 0)
+    assert np.all(np.std(track.actions, axis=(0, 1)) > 0)
+
+
+def test_episodes_start_differently(scene):
+    start = experts(scene.name, 512).episode
+    assert any(np.std(x, axis=0).max() > 0 for x in jax.tree.leaves((start.start.qpos, start.surroundings.pose)))
+
+
+def test_no_observation_is_constant(scene):
+    seen = experts(scene.name).trajectory.observations
+    own, sets = split_items(scene.sets, seen.shape[-1] - sum(s.count * s.size for s in scene.sets), seen)
+    assert np.all(np.std(own.reshape(-1, own.shape[-1]), axis=0) > 0)
+    for held, items in zip(scene.sets, sets, strict=True):
+        spread = np.std(items.reshape(-1, held.size), axis=0)
+        silent = [] if scene.name in ("double_goal", "intersection") else SILENT[held.name]  # without signals or people
+        assert set(np.flatnonzero(spread == 0)) <= set(silent), (held.name, np.flatnonzero(spread == 0))
+        assert np.all(np.abs(items[items[..., 0] < 0.5]) == 0)  # what is not there says nothing
 
 
 def test_a_rollout_is_a_function_of_its_inputs(scene):
@@ -67,21 +89,27 @@ def test_a_rollout_is_a_function_of_its_inputs(scene):
 def test_rollout_matches_c_mujoco(scene, x64):
     held = jax.tree.map(lambda x: np.asarray(x[1], np.float64), experts(scene.name))
     track = rollout(scene, playback(scene, held.trajectory.actions), held.episode)
-    data = mujoco.MjData(scene.world.mj)
+    model = copy.copy(scene.world.mj)
+    for mocap, (long, wide) in enumerate(held.episode.surroundings.size[0]):
+        body = scene.world.mocap_ids[mocap]
+        if mocap in scene.world.users:
+            model.geom_size[model.body_geomadr[body], :2] = wide / 2, (long - wide) / 2
+    data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = held.episode.start.qpos, held.episode.start.qvel
     for time, action in enumerate(held.trajectory.actions):
-        x, y, heading = held.episode.surroundings.pose[time].T
-        data.mocap_pos[:, 0], data.mocap_pos[:, 1] = x, y
-        data.mocap_quat[:] = np.stack([np.cos(heading / 2), 0 * x, 0 * x, np.sin(heading / 2)], axis=1)
+        before, after = held.episode.surroundings.pose[time], held.episode.surroundings.pose[time + 1]
         data.ctrl[list(scene.world.control_ids)] = action
-        for _ in range(scene.substeps):
-            mujoco.mj_step(scene.world.mj, data)
+        for step in range(scene.substeps):  # bodies move straight on within a control step
+            x, y, heading = (before + step / scene.substeps * (after - before)).T
+            data.mocap_pos[:, 0], data.mocap_pos[:, 1] = x, y
+            data.mocap_quat[:] = np.stack([np.cos(heading / 2), 0 * x, 0 * x, np.sin(heading / 2)], axis=1)
+            mujoco.mj_step(model, data)
         assert np.allclose(track.states.qpos[time + 1], data.qpos, atol=1e-6), time
 
 
 def test_features_and_metrics_are_finite_and_the_expert_equals_itself(scene):
     held = experts(scene.name)
-    features = jax.device_get(jax.vmap(scene.features)(held.episode, held.trajectory))
+    features = jax.device_get(jax.jit(jax.vmap(lambda one: scene.features(one, one.trajectory)))(dataset.without_truth(held)))
     result = scene.metrics(features, features)
     assert all(np.isfinite(v) for v in result.values()) and set(scene.main_metrics) <= set(result)
     assert all(v == 0 for name, v in result.items() if "jsd" in name)
@@ -101,7 +129,9 @@ def test_demonstrations_come_from_the_cache_unchanged(scene, tmp_path, monkeypat
 
 
 def test_cached_demonstrations_depend_on_every_setting(scene):
-    prints = {dataset.fingerprint(s, n, k) for s in (scene, type(scene)(steps=scene.steps + 1)) for n in (8, 9) for k in (0, 1)}
+    prints = {
+        dataset.fingerprint(s, n, k) for s in (scene, dataclasses.replace(scene, steps=scene.steps + 1)) for n in (8, 9) for k in (0, 1)
+    }
     assert len(prints) == 8
 
 
@@ -126,8 +156,10 @@ def test_environment_lives_whole_episodes_and_keeps_dm_controls_physics_in_step(
             steps.append(environment.step(action))
         assert len(steps) == scene.steps + 1 and steps[-1].discount == 1.0
         assert all(s.observation.shape == environment.observation_spec().shape for s in steps)
+    state = environment._now[2]
+    assert np.allclose(environment.physics.data.qpos, state.qpos, atol=1e-6)
     body = environment.physics.named.data.xpos[scene.agent_body]
-    assert np.allclose(body[:2], steps[-1].observation[:2], atol=1e-5)
+    assert np.allclose(body[:2], np.asarray(scene.world.mj.body(scene.agent_body).pos)[:2] + state.qpos[:2], atol=1e-5)
     assert environment.physics.data.time == pytest.approx(scene.steps * environment.control_timestep())
 
 
@@ -180,13 +212,13 @@ def test_both_goals_are_equally_easy():
     for probability in (1.0, 0.0):
         scene = DoubleGoal(lower_probability=probability)
         held = jax.jit(jax.vmap(lambda k, scene=scene: dataset.demonstrate(scene, k)))(random.split(random.key(6), 512))
-        returns.append(np.asarray(jax.vmap(scene.features)(held.episode, held.trajectory)["return"]))
+        returns.append(np.asarray(jax.vmap(scene.features)(held, held.trajectory)["return"]))
     assert abs(returns[0].mean() - returns[1].mean()) < 3 * np.hypot(*(r.std() / np.sqrt(len(r)) for r in returns))
 
 
 def test_expert_turns_left_as_often_as_right_to_either_goal():
     held = experts("double_goal")
-    features = jax.vmap(made("double_goal").features)(held.episode, held.trajectory)
+    features = jax.vmap(made("double_goal").features)(held, held.trajectory)
     left, upper = np.asarray(features["left"]) == 1, np.asarray(features["upper"]) == 1
     assert np.mean(left == (held.truth["bend"] < 0)) > 0.95  # it heads off to one side and comes back by turning to the other
     assert abs(np.mean(left[upper]) - 0.5) < 0.15 and abs(np.mean(left[~upper]) - 0.5) < 0.1
@@ -200,5 +232,5 @@ def test_return_counts_steps_at_a_goal():
     states = jax.tree.map(lambda x: jnp.broadcast_to(x, (5, *x.shape)), episode.start)
     at_goal = type(states)(goal.at[4, 0].add(0.101), states.qvel, states.warmstart)
     track = rollout(scene, playback(scene, jnp.zeros((4, 2))), episode)
-    features = scene.features(episode, type(track)(at_goal, track.observations, track.actions))
+    features = scene.features(Demonstration(episode, track, ()), type(track)(at_goal, track.observations, track.actions))
     assert features["return"] == 3 and features["upper"] == 1

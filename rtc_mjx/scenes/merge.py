@@ -27,7 +27,7 @@ ANGLE = (0.2, 0.32)  # rad, between ramp and road
 JOIN = 35.0  # m, length of the lane that joins
 MIDDLE = 18.0  # m, from where the ramp has joined to where the exit leaves
 RAMP, ROAD = 90.0, 160.0  # m
-BACK = (2.0, 22.0)  # m, the agent's nose from the give-way line at t = 0
+BACK = (6.0, 32.0)  # m, the agent's nose from the give-way line at t = 0
 SPEED = (10.0, 13.0)  # m/s, what drivers want on a free road
 FLOW = (7.5, 10.0)  # m/s, of the road
 UPSTREAM, RAMP_LANE, JOINING, BETWEEN, ONWARD, LEAVING = range(6)

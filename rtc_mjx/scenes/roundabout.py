@@ -23,12 +23,12 @@ from rtc_mjx.scenes.traffic import Drivers, drive
 from rtc_mjx.trajectory import Episode
 
 WIDTH = 4.2  # m, of a lane
-RING = (15.0, 18.0)  # m, radius of the ring's centre line
+RING = (12.0, 15.0)  # m, radius of the ring's centre line
 FLARE = 0.5  # rad, of the ring, between the middle of an arm and where its entry joins or its exit leaves
-MOUTH = 14.0  # m, from the ring's centre line outwards, where an arm begins to bend
+MOUTH = 11.0  # m, from the ring's centre line outwards, where an arm begins to bend
 ARM = 100.0  # m
 KERB = 40  # pieces of a kerb between two arms
-BACK = (3.0, 35.0)  # m, the agent's nose from the give-way line at t = 0
+BACK = (2.0, 16.0)  # m, the agent's nose from the give-way line at t = 0
 SPEED = (7.0, 11.0)  # m/s, what the agent's driver wants on a free road
 CIRCLING = (4.6, 5.6)  # m/s, what the others want: not faster than one who has just joined
 IN, ENTRY, SHORT, LONG, EXIT, OUT = range(6)  # lanes of an arm: in, onto the ring, to the next exit, past it to the next entry, off, out

@@ -1,0 +1,354 @@
+"""Laws of every driving scene, of the road graph and the routes found in it, and of driving's metrics."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from jax import random
+
+from rtc_mjx import dataset
+from rtc_mjx.logs import AMBER, GREEN, NO_SIGNAL, RED, VEHICLE, LoggedScene, RoadGraph
+from rtc_mjx.physics import PhysicsState, specialised_step, substates
+from rtc_mjx.rollout import rollout
+from rtc_mjx.scenes import SCENES, Actor, split_items
+from rtc_mjx.scenes.driving import AWAY, CAR, OWN, Driving, nearest_users, ran_red
+from rtc_mjx.scenes.intersection import cycle
+from rtc_mjx.scenes.routes import BEHIND, NOWHERE, RouteOptions, find_routes
+from rtc_mjx.scenes.traffic import Drivers, Walkers, drive, follow_the_leader, must_stop, slow_for_bends, walk
+from rtc_mjx.trajectory import Demonstration, Trajectory
+
+DRIVING = tuple(name for name, scene in SCENES.items() if issubclass(scene, Driving))
+
+
+@functools.cache
+def made(name):
+    return SCENES[name]()
+
+
+@functools.cache
+def demonstrated(name, count=512):
+    """Demonstrations and their features."""
+    scene = made(name)
+    held = jax.jit(jax.vmap(lambda key: dataset.demonstrate(scene, key)))(random.split(random.key(5), count))
+    features = jax.jit(jax.vmap(lambda one: scene.features(one, one.trajectory)))(dataset.without_truth(held))
+    return jax.device_get(held), jax.device_get(features)
+
+
+@pytest.fixture(params=DRIVING)
+def scene(request):
+    return made(request.param)
+
+
+def straight_road(count=1, lanes=2, users=3, times=91):
+    """A lane of 100 m along x that goes on in `count` lanes, with no users but the agent at 20 m and what tests put there."""
+    first = jnp.stack([jnp.linspace(0, 100, 24), jnp.zeros(24)], axis=1)
+    ways = [jnp.stack([jnp.linspace(100, 200, 24), k * jnp.linspace(0, 30, 24)], axis=1) for k in range(count)]
+    graph = RoadGraph(
+        lanes=jnp.stack([first, *ways]),
+        successors=jnp.full((count + 1, max(1, count)), -1).at[0].set(jnp.arange(1, count + 1)),
+        gives_way=jnp.zeros(count + 1, int), edges=jnp.array([[[-50.0, -2.0], [300.0, -2.0]]]), edge_valid=jnp.ones(1, bool),
+        crosswalks=jnp.zeros((1, 4, 2)),
+    )  # fmt: skip
+    pose = jnp.zeros((users, times, 3)).at[0, :, 0].set(20.0)
+    return LoggedScene(
+        road=graph, signals=jnp.zeros((times, count + 1), int), pose=pose, velocity=jnp.zeros((users, times, 2)),
+        size=jnp.full((users, 2), 2.0).at[:, 0].set(4.0), kind=jnp.zeros(users, int).at[0].set(VEHICLE),
+        valid=jnp.zeros((users, times), bool).at[0].set(True), controlled=jnp.array(0),
+    )  # fmt: skip
+
+
+# Every driving scene
+
+
+def test_the_world_has_its_named_parts_and_two_cameras(scene):
+    names = [scene.world.mj.camera(i).name for i in range(scene.world.mj.ncam)]
+    assert {"car0/top", "car0/chase"} <= set(names)
+    assert scene.world.control_names == ("car0/drive", "car0/steer")
+    assert len(scene.world.users) == scene.road_users
+
+
+def test_experts_arrive_without_accident(scene):
+    """Rates like those of the paper's data: collisions below 1.5 % and off the road below 1 % of the time (3 % at the roundabout)."""
+    held, features = demonstrated(scene.name)
+    assert np.mean(features["collision"]) <= (0.03 if scene.name == "roundabout" else 0.015)
+    assert np.mean(features["offroad"]) < 0.01
+    assert np.mean(features["ran_red"]) < 0.02
+    assert np.mean(features["progress"]) > 15 and np.max(features["progress"]) > 50
+
+
+def test_experts_take_the_route_they_have_in_mind(scene):
+    held, _ = demonstrated(scene.name)
+    label = jax.vmap(scene.label)(held)
+    assert np.allclose(np.sum(label, axis=1), 1)
+    assert np.mean(np.take_along_axis(np.asarray(label), held.truth["route"][:, None], 1) > 0) > 0.97
+    parted = np.max(label, axis=1) == 1
+    assert np.mean(parted) > 0.15 and len(set(held.truth["route"][parted])) > 1
+
+
+def test_surroundings_do_not_depend_on_the_expert(scene):
+    """xi is drawn without the expert: two experts of one episode meet the same surroundings and drive differently."""
+    episode = scene.reset(random.key(3))
+
+    def one(key):
+        actor, truth = scene.expert(key, episode)
+        return rollout(scene, actor, episode).states.qpos[-1], truth["speed"]
+
+    ends, speeds = jax.jit(jax.vmap(one))(random.split(random.key(1), 16))
+    assert np.std(speeds) > 0.3 and np.std(ends[:, :2], axis=0).max() > 0.5
+
+
+def test_road_users_that_are_not_there_are_far_away_and_unseen(scene):
+    held, _ = demonstrated(scene.name)
+    gone = ~held.episode.context.present
+    assert np.all(np.abs(held.episode.surroundings.pose[gone][:, :2]).max(axis=1) >= AWAY)
+    _, (_, users) = split_items(scene.sets, OWN, held.trajectory.observations)
+    assert np.all(users[gone] == 0)
+
+
+def test_observations_do_not_depend_on_where_and_which_way_the_world_lies(scene):
+    """The same scene turned and moved looks the same from the car."""
+    log = scene.log(random.key(2))
+    turn, shift = 0.7, jnp.array([30.0, -12.0])
+
+    def points(x):
+        cos, sin = jnp.cos(turn), jnp.sin(turn)
+        return jnp.stack([cos * x[..., 0] - sin * x[..., 1], sin * x[..., 0] + cos * x[..., 1]], axis=-1)
+
+    road = dataclasses.replace(log.road, lanes=points(log.road.lanes) + shift, edges=points(log.road.edges) + shift)
+    pose = jnp.concatenate([points(log.pose[..., :2]) + shift, log.pose[..., 2:] + turn], axis=-1)
+    moved = dataclasses.replace(log, road=road, pose=pose, velocity=points(log.velocity))
+    here, there = scene.episode(log), scene.episode(moved)
+    seen = [scene.observe(e, jnp.array(0), e.start) for e in (here, there)]
+    assert np.allclose(*seen, atol=2e-2)
+
+
+def test_gradients_are_finite_and_right_through_a_collision(scene, x64):
+    """The car runs into somebody who stands ahead: dx_T / da_t against central differences."""
+    episode = jax.tree.map(lambda x: x.astype(float) if jnp.issubdtype(x.dtype, jnp.floating) else x, scene.reset(random.key(0)))
+    heading = episode.start.qpos[2]
+    ahead = episode.start.qpos[:2] + 12 * jnp.stack([jnp.cos(heading), jnp.sin(heading)]) + jnp.array([0.3, 0.2])
+    pose = episode.surroundings.pose.at[:, 0].set(jnp.concatenate([ahead, heading[None] + 0.3]))
+    size = episode.surroundings.size.at[:, 0].set(jnp.array([4.5, 1.9]))
+    episode = dataclasses.replace(episode, surroundings=type(episode.surroundings)(pose, size))
+    actions = jnp.tile(jnp.array([3.0, 0.01]), (scene.steps, 1))
+
+    @jax.jit
+    def end(actions):
+        return jnp.sum(rollout(scene, Actor((), lambda m, o, a: (m, a), actions), episode).states.qpos[20, :2])
+
+    track = rollout(scene, Actor((), lambda m, o, a: (m, a), actions), episode)
+    gap = jax.vmap(lambda q: jnp.min(scene_gap(q, episode)))(track.states.qpos)
+    assert np.min(gap) < 0.05  # they did touch
+    slope = jax.jit(jax.grad(end))(actions)
+    assert np.all(np.isfinite(slope))
+    for step, control in ((0, 0), (0, 1), (4, 1)):
+        nudge = jnp.zeros_like(actions).at[step, control].set(1e-6)
+        difference = (end(actions + nudge) - end(actions - nudge)) / 2e-6
+        assert np.isclose(slope[step, control], difference, rtol=1e-4, atol=1e-6)
+
+
+def scene_gap(qpos, episode):
+    from rtc_mjx.geometry import capsule_gap
+
+    return capsule_gap(qpos[:3], jnp.array(CAR), episode.surroundings.pose[0], episode.surroundings.size[0])
+
+
+def test_a_dressed_world_compiles_and_shows_signals(scene):
+    episode = jax.tree.map(np.asarray, scene.reset(random.key(1)))
+    spec = scene.world.spec.copy()
+    scene.dress(spec, episode)
+    model = spec.compile()
+    scene.paint(model, episode, 0)
+    assert model.ngeom > scene.world.mj.ngeom + 40
+    assert sum(model.geom(i).name.startswith("signal") for i in range(model.ngeom)) == (12 if scene.name == "intersection" else 0)
+    mujoco.mj_forward(model, mujoco.MjData(model))
+
+
+# Routes
+
+
+def test_routes_of_the_intersection_lead_left_on_and_right():
+    log = made("intersection").log(random.key(0))
+    routes = find_routes(log, log.pose[0, 0], RouteOptions())
+    assert np.all(routes.valid) and routes.dropped == 0
+    way = routes.paths[:, 60] - routes.paths[:, 59]
+    assert np.array_equal(np.round(way / 2), [[-1, 0], [0, 1], [1, 0]])
+    assert np.allclose(routes.stop, routes.stop[0]) and BEHIND < routes.stop[0] < 70
+    assert np.array_equal(routes.gives_way_to, [1, 0, 0])
+    assert np.allclose(np.linalg.norm(np.diff(routes.paths, axis=1), axis=-1), 2.0, atol=0.05)
+    start = log.pose[0, 0, :2]
+    assert np.min(np.linalg.norm(routes.paths[:, 5] - start, axis=1)) < 0.6  # the sixth point is beside the car
+
+
+def test_a_road_that_ends_goes_straight_on_and_has_no_lines():
+    log = straight_road(count=0)
+    routes = find_routes(log, log.pose[0, 0], RouteOptions(count=2))
+    assert list(routes.valid) == [True, False] and routes.stop[0] == NOWHERE and np.all(routes.signals == NO_SIGNAL)
+    assert np.allclose(routes.paths[0, :, 0], 10 + 2.0 * np.arange(80), atol=1e-3) and routes.end[0] == pytest.approx(90.0)
+
+
+def test_routes_beyond_those_that_fit_are_counted():
+    log = straight_road(count=5)
+    routes = find_routes(log, log.pose[0, 0], RouteOptions(count=3))
+    assert np.all(routes.valid) and routes.dropped == 2
+    assert np.array_equal(routes.lanes[:, 1], [1, 2, 3])
+    assert not routes.branching[0, 20] and routes.branching[0, 60]  # lanes branch after 100 m
+
+
+# The logged scene becomes an episode
+
+
+def crowded(distances):
+    """A road with users at distances ahead of the agent."""
+    log = straight_road(users=len(distances) + 1)
+    pose = log.pose.at[1:, :, 0].set(20.0 + jnp.array(distances)[:, None])
+    return dataclasses.replace(log, pose=pose, kind=jnp.full(len(distances) + 1, VEHICLE), valid=jnp.ones_like(log.valid))
+
+
+def test_the_nearest_road_users_are_kept_and_the_others_counted():
+    kept, dropped = nearest_users(crowded([50.0, 10.0, 30.0, 20.0, 40.0]), 3)
+    assert list(kept) == [2, 4, 3] and dropped == 2
+    assert made("intersection").episode(crowded([float(10 + 7 * i) for i in range(11)])).context.dropped == 3
+
+
+def test_the_agent_is_not_among_its_own_surroundings():
+    episode = made("intersection").episode(straight_road())
+    assert not np.any(episode.context.present)
+
+
+def test_a_road_user_that_overlaps_the_agent_at_first_does_not_count_as_its_collision():
+    scene = made("intersection")
+    episode = scene.episode(crowded([2.0, 30.0]))
+    track = rollout(scene, Actor((), lambda m, o, a: (m, a), jnp.zeros((scene.steps, 2))), episode)
+    assert list(episode.context.ghosts[:2]) == [True, False]
+    assert not scene.features(Demonstration(episode, track, ()), track)["collision"]
+
+
+def test_an_agent_that_the_log_has_off_the_road_is_masked():
+    scene, log = made("intersection"), straight_road()
+    off = dataclasses.replace(log, pose=log.pose.at[0, :, 1].set(-6.0))
+    assert scene.episode(off).context.starts_off_road and not scene.episode(log).context.starts_off_road
+
+
+# Metrics by hand
+
+
+def played(scene, episode, positions):
+    """A trajectory through given (x, y, heading), observations left out."""
+    qpos = jnp.zeros((scene.steps + 1, 4)).at[:, :3].set(positions)
+    warm = jnp.broadcast_to(episode.start.warmstart, (scene.steps + 1, *episode.start.warmstart.shape))
+    return Trajectory(PhysicsState(qpos, jnp.zeros_like(qpos), warm), jnp.zeros((scene.steps + 1, 1)), jnp.zeros((scene.steps, 2)))
+
+
+def line(scene, start, end):
+    share = jnp.linspace(0, 1, scene.steps + 1)[:, None]
+    return jnp.concatenate([jnp.array(start) + share * (jnp.array(end) - jnp.array(start)), jnp.zeros((scene.steps + 1, 1))], axis=1)
+
+
+def test_features_of_a_trajectory_worked_out_by_hand():
+    """The expert stands still; the agent glides 30 m along x and drifts 1.2 m to the right, past the edge at y = -2 with its corners."""
+    scene = made("intersection")
+    episode = scene.episode(straight_road())
+    expert = Demonstration(episode, played(scene, episode, line(scene, [20.0, 0.0], [20.0, 0.0])), ())
+    features = scene.features(expert, played(scene, episode, line(scene, [20.0, 0.0], [50.0, -1.2])))
+    assert features["ade"] == pytest.approx(np.hypot(30, 1.2) / 2, rel=1e-4)
+    assert features["progress"] == pytest.approx(np.hypot(30, 1.2), rel=1e-4)
+    beyond = np.mean(np.linspace(0, 1.2, 31) > 2 - 1.9 / 2)
+    assert features["offroad"] == pytest.approx(beyond) and not features["collision"]
+
+
+def test_collisions_between_control_steps_are_seen():
+    """A crossing car passes through the agent's place within one control step: no logged time shows them together."""
+    scene, log = made("intersection"), crowded([0.0])
+    times = jnp.arange(91)
+    pose = log.pose.at[1].set(jnp.stack([jnp.full(91, 20.0), 6.0 - 12.0 * (times >= 45) - 0.0 * times, jnp.full(91, np.pi / 2)], axis=1))
+    episode = scene.episode(dataclasses.replace(log, pose=pose))
+    assert np.all(np.abs(episode.surroundings.pose[:, 0, 1]) == 6.0)
+    still = rollout(scene, Actor((), lambda m, o, a: (m, a), jnp.zeros((scene.steps, 2))), episode)
+    features = scene.features(Demonstration(episode, still, ()), still)
+    assert features["collision"] and features["overlap"]
+
+
+def test_min_ade_is_the_best_of_the_samples():
+    scene = made("intersection")
+    _, features = demonstrated("intersection")
+    expert = {k: v[:4] for k, v in features.items()}
+    two = {k: np.stack([v, v]) for k, v in expert.items()} | {"ade": np.array([[1.0, 2.0, 3.0, 4.0], [3.0, 1.0, 3.0, 2.0]])}
+    assert scene.metrics(two, expert)["min_ade"] == pytest.approx((1 + 1 + 3 + 2) / 4)
+
+
+def test_running_a_red_light_is_crossing_its_line_while_it_is_red():
+    log = straight_road(count=1)
+    for state, expected in ((RED, True), (AMBER, False), (GREEN, False), (NO_SIGNAL, False)):
+        signals = jnp.zeros((91, 2), int).at[:, 1].set(state)
+        episode = made("intersection").episode(dataclasses.replace(log, signals=signals))
+        qpos = played(made("intersection"), episode, line(made("intersection"), [70.0, 0.0], [130.0, 0.0])).states.qpos
+        assert bool(ran_red(episode.context.routes, qpos)) is expected
+        before = played(made("intersection"), episode, line(made("intersection"), [20.0, 0.0], [97.0, 0.0])).states.qpos
+        assert not ran_red(episode.context.routes, before)
+
+
+# Traffic
+
+
+def test_signals_follow_green_amber_red_and_are_never_green_both_ways():
+    ahead, across = jax.vmap(lambda key: cycle(key, 400))(random.split(random.key(0), 64))
+    assert not np.any((ahead != RED) & (across != RED))
+    for lights in (np.asarray(ahead), np.asarray(across)):
+        changes = {(int(a), int(b)) for row in lights for a, b in zip(row[:-1], row[1:], strict=True) if a != b}
+        assert changes == {(GREEN, AMBER), (AMBER, RED), (RED, GREEN)}
+
+
+def test_a_driver_behind_another_settles_at_its_headway():
+    speed, gap = jnp.array(10.0), jnp.array(30.0)
+    for _ in range(600):  # 60 s behind somebody at 10 m/s
+        pull = follow_the_leader(speed, jnp.array(15.0), gap, speed - 10.0, headway=jnp.array(1.5))
+        gap, speed = gap + 0.1 * (10.0 - speed), speed + 0.1 * pull
+    rest = (2.0 + 15.0) / np.sqrt(1 - (10 / 15) ** 4)  # Treiber et al. 2000, equilibrium gap
+    assert abs(gap - rest) < 0.1 and abs(speed - 10) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("speed", "distance", "signal", "stops"), [(10, 20, RED, True), (10, 20, AMBER, True), (10, 10, AMBER, False), (10, 20, GREEN, False)]
+)
+def test_who_stops_for_a_signal(speed, distance, signal, stops):
+    assert bool(must_stop(jnp.array(float(speed)), jnp.array(float(distance)), jnp.array(signal))) is stops  # 10 m: 5 m/s^2
+
+
+def test_bends_are_slowed_down_for_in_time():
+    bearing = jnp.clip((jnp.arange(40) - 20) * 2.0 / 10.0, 0, 3)
+    path = jnp.stack([2.0 * jnp.minimum(jnp.arange(40), 20) + 10 * jnp.sin(bearing), 10 * (1 - jnp.cos(bearing))], axis=1)
+    allowed = slow_for_bends(path, 2.0, jnp.array(12.0))
+    assert allowed[25] == pytest.approx(np.sqrt(2.5 * 10), rel=0.05) and allowed[0] == pytest.approx(12.0)
+    assert np.all(np.diff(allowed[:20] ** 2) > -2 * 2.0 * 2.0 - 1e-3)  # never more than 2 m/s^2 of braking
+
+
+def test_replayed_drivers_wait_at_red_and_people_walk_at_green():
+    path = jnp.stack([2.0 * jnp.arange(60), jnp.zeros(60)], axis=1)
+    lights = jnp.where(jnp.arange(200)[:, None] < 120, RED, GREEN) * jnp.ones((1, 1), int)
+    one = {name: jnp.array([value]) for name, value in dict(
+        station=10.0, speed=8.0, desired=10.0, headway=1.2, length=4.5, until=1e3, stop=60.0, brakes=1e3, brakes_for=0.0
+    ).items()}  # fmt: skip
+    pose, speed = drive(Drivers(paths=path[None], leader=jnp.array([-1]), signals=lights, **one), 2.0, 200)
+    nose = pose[:, 0, 0] + 4.5 / 2
+    assert np.max(nose[:120]) < 60 and np.max(speed[110:120]) < 0.3 and nose[-1] > 75
+    people = Walkers(jnp.array([[0.0, 0.0]]), jnp.array([[0.0, 7.0]]), jnp.array([1.4]), jnp.array([2.0]), lights == GREEN)
+    pose, speed = walk(people, 200)
+    assert np.all(pose[:121, 0, 1] == 0) and pose[-1, 0, 1] == pytest.approx(7.0) and np.max(speed) == pytest.approx(1.4)
+
+
+def test_substates_end_where_the_rollout_goes_on():
+    scene = made("intersection")
+    held, _ = demonstrated("intersection")
+    one = jax.tree.map(lambda x: jnp.asarray(x[0]), dataset.without_truth(held))
+    states = jax.tree.map(lambda x: x[3], one.trajectory.states)
+    before, after = (jax.tree.map(lambda x, t=t: x[t], one.episode.surroundings) for t in (3, 4))
+    step = specialised_step(scene.world)
+    inner, around = substates(scene.world, scene.substeps, step)(states, one.trajectory.actions[3], before, after)
+    assert np.allclose(inner.qpos[0], states.qpos)
+    last = step(jax.tree.map(lambda x: x[-1], inner), one.trajectory.actions[3], jax.tree.map(lambda x: x[-1], around))
+    assert np.allclose(last.qpos, one.trajectory.states.qpos[4], atol=1e-4)
