@@ -10,11 +10,13 @@ CHECK_PYTHON := import sys; sys.exit(0 if sys.version_info[:2] in ((3, 11), (3, 
 test: lint
 	$(BIN)/python -m pytest
 
-# Until the intersection lands, its stand-in is the double goal problem. A run that was stopped goes on where it was.
-RUN := runs/double_goal/rtc_c
+# A run that was stopped goes on where it was.
+RUN := runs/intersection/rtc_c
 train: .venv/.installed
-	$(BIN)/python -m rtc_mjx.train --scene double_goal --method rtc --run $(RUN) $(if $(wildcard $(RUN)/config.json),--resume)
-	$(BIN)/python -m rtc_mjx.render --run $(RUN) --out $(RUN)/media/top.mp4
+	$(BIN)/python -m rtc_mjx.train --scene intersection --method rtc --run $(RUN) $(if $(wildcard $(RUN)/config.json),--resume)
+	$(BIN)/python -m rtc_mjx.render --run $(RUN) --out $(RUN)/media/top.mp4 --camera top
+	$(BIN)/python -m rtc_mjx.render --run $(RUN) --out $(RUN)/media/chase.mp4 --camera chase
+	$(BIN)/python -m rtc_mjx.report $(RUN) --out $(RUN)/report
 
 lint: .venv/.installed
 	$(BIN)/ruff check .

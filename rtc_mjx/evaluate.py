@@ -116,6 +116,7 @@ def evaluate(run: Run, episodes: int) -> dict[str, Any]:
         "update": update,
         "metrics": means["prior"],
         "types": means,
+        "notes": {what: count for what, count in config.scene.notes(tests[0].episode).items() if count},
         "reference": {"expert": config.scene.metrics(expert, expert), "expert_vs_expert": config.scene.metrics(second, expert)},
     }
 
@@ -163,7 +164,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     cache.keep_compiled()
     run = Run.open(options.run)
     result = evaluate(run, options.episodes or run.config.experts.test)
-    Console(width=None if Console().is_terminal else 140).print(table(result))
+    console = Console(width=None if Console().is_terminal else 140)
+    console.print(table(result))
+    for what, count in result["notes"].items():
+        console.print(f"{count} {what}")
     write_whole(run.folder / "evaluation.json", json.dumps(result, indent=1) + "\n")
 
 

@@ -105,6 +105,10 @@ class Scene(abc.ABC):
         """A typical size of each control: what a policy puts out is in these units."""
         return np.ones(len(self.world.control_ids))
 
+    def notes(self, episodes: Episode) -> dict[str, int]:
+        """What a reader of metrics on these episodes (leading axis) should know: what was left out or not counted, and how often."""
+        return {}
+
     def dress(self, spec: mujoco.MjSpec, episode: Episode) -> None:
         """Adds to a world's specification what only pictures of an episode need; nothing unless a scene says so."""
         return

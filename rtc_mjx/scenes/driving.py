@@ -110,6 +110,16 @@ class Driving(Scene):
         """After the car itself: the routes, then the road users."""
         return (ItemSet("routes", self.route_options.count, 11 + 2 * len(AHEAD)), ItemSet("road_users", self.road_users, 11))
 
+    def notes(self, episodes: Episode) -> dict[str, int]:
+        """Agents and road users that metrics or bodies leave out."""
+        road = episodes.context
+        return {
+            "agents that touch somebody at t = 0 (not counted as collisions)": int(np.sum(np.any(road.ghosts, axis=-1))),
+            "agents off the road at t = 0 (not counted as off-road time)": int(np.sum(road.starts_off_road)),
+            "road users without a body": int(np.sum(road.dropped)),
+            "routes beyond those that fit": int(np.sum(road.routes.dropped)),
+        }
+
     def dress(self, spec: mujoco.MjSpec, episode: Episode) -> None:
         """Kerbs, lanes, crosswalks and stop lines."""
         scenery.dress(spec, episode.context, np.asarray(episode.start.qpos[:2]))
