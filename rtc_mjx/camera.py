@@ -25,6 +25,9 @@ class Camera(Protocol):
     def __call__(self, data: mujoco.MjData) -> Picture:
         """The picture of a state; `mj_forward` has been called on it."""
 
+    def close(self) -> None:
+        """Gives back what it holds; another camera may then be made."""
+
 
 def camera(model: mujoco.MjModel, name: str, height: int, width: int) -> Camera:
     """A camera of the model, by OpenGL if a context can be made, else by rays (a warning says so once).
@@ -61,6 +64,10 @@ class GlCamera:
         self.renderer.update_scene(data, self.name)
         return self.renderer.render()
 
+    def close(self) -> None:
+        """Frees the context: one that is freed while another is in use takes that one's picture away."""
+        self.renderer.close()
+
 
 class RayCamera:
     """A camera by `mj_multiRay`; needs no OpenGL."""
@@ -91,6 +98,9 @@ class RayCamera:
         facing = np.abs(np.sum(normals.reshape(-1, 3) * rays, axis=1))
         shaded = np.where((ids >= 0)[:, None], colour * (AMBIENT + DIFFUSE * facing[:, None]), SKY)
         return (255 * np.clip(shaded, 0, 1)).astype(np.uint8).reshape(*self.shape, 3)
+
+    def close(self) -> None:
+        """Nothing is held."""
 
     def _groups(self) -> Any:
         return np.array([1, 1, 1, 0, 0, 0], np.uint8)  # what a viewer shows at first

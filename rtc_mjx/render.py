@@ -123,6 +123,7 @@ def pictures(run: Run, shown: Demonstration, tracks: Trajectory, camera_name: st
                 picture = take(data)
             for _ in range(HOLD if time == scene.steps else 1):
                 yield picture
+        take.close()
 
 
 def paint_agent(model: mujoco.MjModel, body: str, marks: int, actor: int) -> None:

@@ -93,7 +93,7 @@ class Driving(Scene):
     @functools.cached_property
     def world(self) -> World:
         """One car, and bodies for road users."""
-        return load("driving", road_users=self.road_users)
+        return car_among(self.road_users)
 
     @property
     def control_unit(self) -> Float[np.ndarray, "controls"]:
@@ -256,6 +256,12 @@ class Driving(Scene):
             "progress_jsd": metrics.jsd(features["progress"], expert["progress"], bins=BINS, limits=span(expert["progress"])),
             "ran_red_rate": float(np.mean(features["ran_red"])),
         }
+
+
+@functools.lru_cache(maxsize=8)
+def car_among(road_users: int) -> World:
+    """The driving world with one car; one object for all scenes, so that its specialised step is made once."""
+    return load("driving", road_users=road_users)
 
 
 def span(values: np.ndarray) -> tuple[float, float]:

@@ -12,6 +12,7 @@ from rtc_mjx.logs.scene import lane_exists
 if TYPE_CHECKING:
     from rtc_mjx.scenes.driving import Road
 
+ASPHALT, SURFACE = (0.30, 0.31, 0.33), 1.9  # colour, and half the width in m
 KERB, LANE, STRIPE, ROUTE = (0.86, 0.86, 0.82), (0.62, 0.64, 0.60), (0.90, 0.90, 0.88), (0.55, 0.60, 0.80)
 LIGHTS = {RED: (0.85, 0.16, 0.13), AMBER: (0.95, 0.70, 0.10), GREEN: (0.16, 0.66, 0.30), NO_SIGNAL: (0.5, 0.5, 0.5)}
 PERSON = (0.72, 0.22, 0.45)
@@ -26,6 +27,10 @@ def dress(spec: mujoco.MjSpec, road: "Road", start: np.ndarray) -> None:
         _bar(spec, a, b, 0.12, 0.06, KERB, start)
     lanes = np.asarray(road.graph.lanes)
     for lane in lanes[np.asarray(lane_exists(road.graph))]:
+        corners = bends(lane)
+        for a, b in zip(corners[:-1], corners[1:], strict=True):
+            stretch = 0.3 * (b - a) / max(1e-6, float(np.linalg.norm(b - a)))
+            _bar(spec, a - stretch, b + stretch, SURFACE, 0.004, ASPHALT, start)
         for a, b in dashes(lane):
             _bar(spec, a, b, 0.05, 0.01, LANE, start)
     for corners in np.asarray(road.graph.crosswalks):
@@ -51,6 +56,18 @@ def paint(model: mujoco.MjModel, road: "Road", size: np.ndarray, time: int) -> N
         if walks:
             model.geom_matid[body] = -1
             model.geom_rgba[body, :3] = PERSON
+
+
+def bends(lane: np.ndarray) -> np.ndarray:
+    """The points of a lane between which it is straight, within 3 degrees."""
+    kept = [lane[0]]
+    for before, point, after in zip(lane[:-2], lane[1:-1], lane[2:], strict=True):
+        first, second = point - kept[-1], after - before
+        if np.linalg.norm(first) > 1e-6 and np.linalg.norm(second) > 1e-6:
+            turn = np.arctan2(first[0] * second[1] - first[1] * second[0], first @ second)
+            if abs(turn) > np.radians(3):
+                kept.append(point)
+    return np.array([*kept, lane[-1]])
 
 
 def dashes(lane: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
