@@ -30,7 +30,7 @@ WITHIN = {"vehicle": 2.1, "walker": 1.9}  # m from the middle of the way: ahead 
 CROSSES = {"vehicle": 3.0, "walker": 2.4}  # m from the middle of the way: will be in it
 CANNOT_STOP = 7.5  # m/s^2: a line that takes harder braking is passed
 ENTERED = 7.0  # m past a give-way line, where one is in everybody's way
-PASSED = -5.0  # m, behind a give-way line one no longer gives way
+PASSED = -11.0  # m, behind a give-way line one no longer gives way
 LATEST = 4  # control steps by which a driver may see a signal change late
 ROUTES = (0.9, 1.1, 0.9)  # how often each is taken, where there are three
 

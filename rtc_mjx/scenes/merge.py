@@ -24,7 +24,7 @@ from rtc_mjx.trajectory import Episode
 
 WIDTH = 4.0  # m, of a lane
 ANGLE = (0.2, 0.32)  # rad, between ramp and road
-JOIN = 35.0  # m, length of the lane that joins
+JOIN = 20.0  # m, length of the lane that joins
 MIDDLE = 18.0  # m, from where the ramp has joined to where the exit leaves
 RAMP, ROAD = 90.0, 160.0  # m
 BACK = (6.0, 32.0)  # m, the agent's nose from the give-way line at t = 0
