@@ -114,26 +114,35 @@ def our_rollout(world: World, specialised: bool) -> Rollout:
     return lambda state, controls, around: simulate(world, state, controls, around, one_step=one_step)[0].qpos
 
 
-def handwritten_rollout(world: World) -> Rollout | None:
-    """The floor: a damped point mass, or a kinematic bicycle, in plain JAX; None where there is no such thing."""
+def by_hand(world: World) -> OneStep:
+    """The same step by hand-written equations, without contacts: a damped point mass, or a kinematic bicycle about its middle."""
     h = world.timestep
 
-    def point_mass(carry: tuple[Array, Array], force: Array) -> tuple[tuple[Array, Array], None]:
-        position, velocity = carry
-        velocity = (velocity + h * 6.0 * jnp.clip(force, -1, 1)) / (1 + 2.0 * h)
-        return (position + h * velocity, velocity), None
+    def point_mass(state: PhysicsState, force: Array, around: Surroundings) -> PhysicsState:
+        velocity = (state.qvel + h * 6.0 * jnp.clip(force, -1, 1)) / (1 + 2.0 * h)
+        return PhysicsState(state.qpos + h * velocity, velocity, state.warmstart)
 
-    def bicycle(carry: tuple[Array, Array], control: Array) -> tuple[tuple[Array, Array], None]:
-        pose, speed = carry
-        speed = speed + h * jnp.clip(control[0], -8.829, 4)
-        turn = speed * jnp.tan(jnp.clip(control[1], -0.6, 0.6)) / WHEELBASE
-        return (pose + h * jnp.stack([speed * jnp.cos(pose[2]), speed * jnp.sin(pose[2]), turn]), speed), None
+    def bicycle(state: PhysicsState, control: Array, around: Surroundings) -> PhysicsState:
+        heading, steer = state.qpos[2], jnp.clip(control[1], -0.6, 0.6)
+        speed = jnp.cos(heading) * state.qvel[0] + jnp.sin(heading) * state.qvel[1]
+        speed = jnp.maximum(0.0, speed + h * jnp.clip(control[0], -8.829, 4))
+        course = heading + jnp.arctan(0.5 * jnp.tan(steer))
+        qvel = jnp.stack([speed * jnp.cos(course), speed * jnp.sin(course), speed * jnp.tan(steer) / WHEELBASE, jnp.zeros(())])
+        return PhysicsState((state.qpos + h * qvel).at[3].set(steer), qvel, state.warmstart)
 
-    if world.mj.nv == 2:
-        return lambda state, controls, _: lax.scan(point_mass, (state.qpos, state.qvel), controls)[0][0]
+    return point_mass if world.mj.nv == 2 else bicycle
+
+
+def handwritten_rollout(world: World) -> Rollout | None:
+    """The floor: hand-written equations in plain JAX; None where there are road users, whom they do not touch."""
     if world.users:
         return None
-    return lambda state, controls, _: lax.scan(bicycle, (state.qpos[:3], state.qvel[0]), controls)[0][0]
+    one_step = by_hand(world)
+
+    def rollout(state: PhysicsState, controls: Array, around: Surroundings) -> Array:
+        return lax.scan(lambda s, control: (one_step(s, control, around), None), state, controls)[0].qpos
+
+    return rollout
 
 
 def rollouts(world: World) -> dict[str, Rollout]:
@@ -185,25 +194,6 @@ def _seconds(function: Callable[..., Array], inputs: Inputs, calls: int) -> floa
         out = function(*inputs)
     jax.block_until_ready(out)
     return (time.perf_counter() - start) / calls
-
-
-def by_hand(world: World) -> OneStep:
-    """The same step by hand-written equations, without contacts: a damped point mass, or a kinematic bicycle about its middle."""
-    h = world.timestep
-
-    def point_mass(state: PhysicsState, force: Array, around: Surroundings) -> PhysicsState:
-        velocity = (state.qvel + h * 6.0 * jnp.clip(force, -1, 1)) / (1 + 2.0 * h)
-        return PhysicsState(state.qpos + h * velocity, velocity, state.warmstart)
-
-    def bicycle(state: PhysicsState, control: Array, around: Surroundings) -> PhysicsState:
-        heading, steer = state.qpos[2], jnp.clip(control[1], -0.6, 0.6)
-        speed = jnp.cos(heading) * state.qvel[0] + jnp.sin(heading) * state.qvel[1]
-        speed = jnp.maximum(0.0, speed + h * jnp.clip(control[0], -8.829, 4))
-        course = heading + jnp.arctan(0.5 * jnp.tan(steer))
-        qvel = jnp.stack([speed * jnp.cos(course), speed * jnp.sin(course), speed * jnp.tan(steer) / WHEELBASE, jnp.zeros(())])
-        return PhysicsState((state.qpos + h * qvel).at[3].set(steer), qvel, state.warmstart)
-
-    return point_mass if world.mj.nv == 2 else bicycle
 
 
 def updates(scene: str, method: str, rounds: int, seed_counts: Sequence[int]) -> list[dict[str, object]]:

@@ -31,7 +31,7 @@ def test_specialising_is_worth_it(rows):
 
 
 def test_whole_updates_are_measured_on_both_physics():
-    held = benchmark.updates("mgail", rounds=1, seed_counts=(1,))
+    held = benchmark.updates("double_goal", "mgail", rounds=1, seed_counts=(1,))
     assert {r["physics"] for r in held} == {"mjx", "handwritten"} and all(r["ms"] > 0 for r in held)
     assert benchmark.updates_table(held).row_count == 2
 
