@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import tempfile
+from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 
@@ -15,11 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from rtc_mjx import cache
+from rtc_mjx.errors import UsageError
 from rtc_mjx.keys import stream
 from rtc_mjx.models import Statistics
 from rtc_mjx.rollout import rollout
 from rtc_mjx.scenes import Scene
-from rtc_mjx.trajectory import Demonstration
+from rtc_mjx.trajectory import Demonstration, Episode
 
 TRAIN, TEST, SECOND_TEST = 0, 1, 2  # seeds of the independent sets: to learn from, to compare with, to compare these with
 CHUNK = 1024  # episodes simulated at once
@@ -51,6 +53,26 @@ def demonstrations(scene: Scene, count: int, seed: int) -> Demonstration:
         leaves = jax.tree.leaves(jax.tree.map(lambda *x: np.concatenate(x), *parts))
         _write(file, leaves)
     return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
+
+
+def redriven(scene: Scene, count: int, seed: int, change: Callable[[Episode], Episode | None]) -> Demonstration:
+    """The demonstrations of a seed driven once more by the same experts, with the same minds, in episodes that were changed.
+
+    Raises:
+        UsageError: the scene has nothing to change.
+    """
+
+    def one(key: jax.Array) -> Demonstration:
+        outside, inside = jax.random.split(key)
+        episode = scene.reset(outside)
+        changed = change(episode)
+        if changed is None:
+            raise UsageError(f"scene {scene.name} has nothing to change")
+        actor, _ = scene.expert(inside, changed)
+        return Demonstration(changed, rollout(scene, actor, changed), ())
+
+    keys = jax.random.split(stream("demonstrations", seed), count)
+    return jax.jit(lambda keys: jax.lax.map(one, keys, batch_size=min(count, CHUNK)))(keys)
 
 
 def fingerprint(scene: Scene, count: int, seed: int) -> str:

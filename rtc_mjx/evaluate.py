@@ -104,7 +104,8 @@ def evaluate(run: Run, episodes: int) -> dict[str, Any]:
     tests = [dataset.demonstrations(config.scene, episodes, seed) for seed in (dataset.TEST, dataset.SECOND_TEST)]
     learner = config.learner(dataset.statistics(config.scene, train))
     update, state, _ = run.restore(start_shapes(learner, config.all_seeds))
-    features = jax.device_get(roller(learner)(state.networks, dataset.without_truth(tests[0]), stream("evaluation", 0)))
+    roll, shown = roller(learner), dataset.without_truth(tests[0])
+    features = jax.device_get(roll(state.networks, shown, stream("evaluation", 0)))
     expert, second = (expert_features(config, test) for test in tests)
     table = score(config, features, expert)
     means = {source: _summaries(config, features[source], expert, table[source]) for source in table}
@@ -116,9 +117,35 @@ def evaluate(run: Run, episodes: int) -> dict[str, Any]:
         "update": update,
         "metrics": means["prior"],
         "types": means,
+        "reaction": reaction(config, roll, state.networks, shown, features, expert),
+        "ranges": config.scene.ranges(expert),
         "notes": {what: count for what, count in config.scene.notes(tests[0].episode).items() if count},
         "reference": {"expert": config.scene.metrics(expert, expert), "expert_vs_expert": config.scene.metrics(second, expert)},
     }
+
+
+def reaction(
+    config: Config, roll: Roll, networks: Networks, shown: Demonstration, features: dict[str, Features], expert: Features
+) -> dict[str, dict[str, float]]:
+    """What agents do when luck is turned round at the same type (method notes, section 7), beside the experts with the same minds.
+
+    Returns:
+        By who acts: `as_it_was` and `flipped`, the share that did what luck bears on, and `like_expert`, the share whose decision
+        in the flipped episode is that of its expert. Empty where the scene has nothing to turn.
+    """
+    if config.scene.flipped(shown.episode) is None:
+        return {}
+    turned = jax.jit(jax.vmap(config.scene.flipped))(shown.episode)
+    count = len(next(iter(expert.values())))
+    again = dataset.without_truth(dataset.redriven(config.scene, count, dataset.TEST, config.scene.flipped))
+    theirs = expert_features(config, again)["decided"]
+    flipped = jax.device_get(roll(networks, Demonstration(turned, shown.trajectory, ()), stream("evaluation", 0)))
+
+    def told(before: np.ndarray, after: np.ndarray) -> dict[str, float]:
+        return {"as_it_was": float(np.mean(before)), "flipped": float(np.mean(after)), "like_expert": float(np.mean(after == theirs))}
+
+    ours = {source: told(features[source]["decided"], flipped[source]["decided"]) for source in features}
+    return ours | {"expert": told(expert["decided"], theirs)}
 
 
 def _summaries(config: Config, features: Features, expert: Features, values: dict[str, list[float]]) -> dict[str, dict[str, Any]]:
@@ -166,6 +193,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     result = evaluate(run, options.episodes or run.config.experts.test)
     console = Console(width=None if Console().is_terminal else 140)
     console.print(table(result))
+    for who, shares in result["reaction"].items():
+        told = ", ".join(f"{name.replace('_', ' ')} {share:.3f}" for name, share in shares.items())
+        console.print(f"signals flipped, {who}: {told}")
     for what, count in result["notes"].items():
         console.print(f"{count} {what}")
     write_whole(run.folder / "evaluation.json", json.dumps(result, indent=1) + "\n")

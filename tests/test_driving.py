@@ -345,6 +345,21 @@ def test_running_a_red_light_is_crossing_its_line_while_it_is_red():
         assert not ran_red(episode.context.routes, before)
 
 
+def test_flipped_signals_are_met_by_the_same_experts_with_the_same_minds(tmp_path, monkeypatch):
+    """Red is green and green is red; experts who look at the light react, and one who drives again without a change does the same."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    scene = made("intersection")
+    held = dataset.demonstrations(scene, 32, 9)
+    again = dataset.redriven(scene, 32, 9, lambda episode: episode)
+    assert np.allclose(again.trajectory.states.qpos, held.trajectory.states.qpos, atol=1e-3)
+    flipped = dataset.redriven(scene, 32, 9, scene.flipped)
+    before, after = held.episode.context.signals, np.asarray(flipped.episode.context.signals)
+    assert np.array_equal(after == GREEN, before == RED) and np.array_equal(after == NO_SIGNAL, before == NO_SIGNAL)
+    assert np.allclose(flipped.episode.start.qpos, held.episode.start.qpos)
+    stopped, went = (np.asarray([one.trajectory.states.qpos[:, -1, 1] for one in (held, flipped)])) > -22
+    assert np.mean(stopped != went) > 0.1
+
+
 # Traffic
 
 

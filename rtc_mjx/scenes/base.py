@@ -109,6 +109,18 @@ class Scene(abc.ABC):
         """What a reader of metrics on these episodes (leading axis) should know: what was left out or not counted, and how often."""
         return {}
 
+    def flipped(self, episode: Episode) -> Episode | None:
+        """The same episode with luck turned round (a red light green); None where there is nothing to turn.
+
+        How an agent reacts tells what its type carries. Features then hold
+        `decided`, whether the agent did what that luck permits or forbids.
+        """
+        return None
+
+    def ranges(self, expert: dict[str, np.ndarray]) -> dict[str, list[float]]:
+        """Ranges of histograms that metrics take from the expert's features."""
+        return {}
+
     def dress(self, spec: mujoco.MjSpec, episode: Episode) -> None:
         """Adds to a world's specification what only pictures of an episode need; nothing unless a scene says so."""
         return

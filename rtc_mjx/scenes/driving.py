@@ -36,6 +36,7 @@ AHEAD = (2.0, 5.0, 8.0, 12.0, 16.0, 20.0, 25.0, 30.0, 40.0, 50.0)  # m along a r
 FAR = 60.0  # m, beyond which nothing is told apart
 OFF_ROUTE = 5.0  # m to the side, beyond which a route is no longer one's own
 SAME_ROUTE = 0.05  # m, mean difference in distance from the path below which routes fit alike
+PAST = 1.0  # m past a stop line, from where it counts as crossed
 AWAY = 1e3  # m, where road users wait that are not there
 BINS = 100  # of the divergences (paper, section V-B)
 SAMPLES = 16  # K of minADE
@@ -119,6 +120,20 @@ class Driving(Scene):
             "road users without a body": int(np.sum(road.dropped)),
             "routes beyond those that fit": int(np.sum(road.routes.dropped)),
         }
+
+    def flipped(self, episode: Episode) -> Episode:
+        """Red lights are green, green and amber ones are red."""
+
+        def turned(signals: Array) -> Array:
+            return jnp.where(signals == RED, GREEN, jnp.where((signals == GREEN) | (signals == AMBER), RED, signals))
+
+        road = episode.context
+        routes = dataclasses.replace(road.routes, signals=turned(road.routes.signals))
+        return dataclasses.replace(episode, context=dataclasses.replace(road, signals=turned(road.signals), routes=routes))
+
+    def ranges(self, expert: dict[str, np.ndarray]) -> dict[str, list[float]]:
+        """Of the curvature where lanes branch, 1/m, and of progress, m."""
+        return {"curvature": list(span(_on_branches(expert))), "progress": list(span(expert["progress"]))}
 
     def dress(self, spec: mujoco.MjSpec, episode: Episode) -> None:
         """Kerbs, lanes, crosswalks and stop lines."""
@@ -223,6 +238,7 @@ class Driving(Scene):
             "curvature": bend,
             "branching": branching,
             "ran_red": ran_red(road.routes, qpos),
+            "decided": jnp.any(jnp.any(crossings(road.routes, qpos), axis=1)),
         }
 
     def encounters(self, episode: Episode, trajectory: Trajectory) -> tuple[Bool[Array, "users"], Bool[Array, "users"]]:
@@ -356,13 +372,18 @@ def _bend(routes: Routes, point: Float[Array, "2"]) -> tuple[Array, Array]:
     return curvature(routes.paths[route], SPACING)[index], routes.branching[route, index]
 
 
-def ran_red(routes: Routes, qpos: Float[Array, "times 4"]) -> Bool[Array, ""]:
-    """Whether the car's nose crossed the stop line of a route it was on while that was red."""
+def crossings(routes: Routes, qpos: Float[Array, "times 4"]) -> Bool[Array, "routes steps"]:
+    """When the car's nose crossed the stop line of each route it was on."""
 
-    def one(path: Array, stop: Array, signals: Array) -> Array:
+    def one(path: Array, stop: Array) -> Array:
         station, aside, _ = jax.vmap(lambda q: project(path, SPACING, q[:2]))(qpos)
-        beyond = station + CAR[0] / 2 > stop + 1.0
-        crossing = ~beyond[:-1] & beyond[1:] & (jnp.abs(aside[1:]) < OFF_ROUTE / 2)
-        return jnp.any(crossing & (signals[:-1] == RED) & (signals[1:] == RED))
+        beyond = station + CAR[0] / 2 > stop + PAST
+        return ~beyond[:-1] & beyond[1:] & (jnp.abs(aside[1:]) < OFF_ROUTE / 2)
 
-    return jnp.any(jax.vmap(one, in_axes=(0, 0, 1))(routes.paths, routes.stop, routes.signals) & routes.valid)
+    return jax.vmap(one)(routes.paths, routes.stop) & routes.valid[:, None]
+
+
+def ran_red(routes: Routes, qpos: Float[Array, "times 4"]) -> Bool[Array, ""]:
+    """Whether the car's nose crossed a stop line while its signal was red."""
+    red = (routes.signals[:-1] == RED) & (routes.signals[1:] == RED)
+    return jnp.any(crossings(routes, qpos) & red.T)
