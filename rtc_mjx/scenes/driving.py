@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rtc_mjx import metrics
-from rtc_mjx.geometry import boxes_overlap, capsule_gap, corners, curvature, off_road, pose_at, project, rotate, wrapped
+from rtc_mjx.geometry import boxes_overlap, capsule_gap, corners, off_road, pose_at, project, rotate, wrapped
 from rtc_mjx.logs import AMBER, GREEN, PEDESTRIAN, RATE, RED, LoggedScene, RoadGraph
 from rtc_mjx.physics import PhysicsState, Surroundings, World, load, rest_state, specialised_step, substates
 from rtc_mjx.pytree import pytree
@@ -369,7 +369,7 @@ def _bend(routes: Routes, point: Float[Array, "2"]) -> tuple[Array, Array]:
     """Curvature of the nearest lane, and whether lanes branch there."""
     distance = jnp.where(routes.valid[:, None], jnp.sum((routes.paths - point) ** 2, axis=-1), jnp.inf)
     route, index = jnp.unravel_index(jnp.argmin(distance), distance.shape)
-    return curvature(routes.paths[route], SPACING)[index], routes.branching[route, index]
+    return routes.curvature[route, index], routes.branching[route, index]
 
 
 def crossings(routes: Routes, qpos: Float[Array, "times 4"]) -> Bool[Array, "routes steps"]:

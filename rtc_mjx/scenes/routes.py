@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rtc_mjx.geometry import Pose, polyline_length, project, resample, wrapped
+from rtc_mjx.geometry import Pose, curvature, polyline_length, project, resample, wrapped
 from rtc_mjx.logs import NO_SIGNAL, LoggedScene, RoadGraph
 from rtc_mjx.pytree import pytree
 
@@ -48,6 +48,7 @@ class Routes:
         give_way: station in m of the line behind which others go first; NOWHERE where there is none.
         gives_way_to: 0 nobody, 1 those who come towards the agent, 2 everybody.
         branching: whether a point lies on a lane that is one of several ways on.
+        curvature: at each point, 1/m, positive to the left.
         end: station in m at which the graph ends; beyond it a path goes straight on.
         dropped: routes that the graph offers beyond these.
     """
@@ -60,6 +61,7 @@ class Routes:
     give_way: Float[Array, "*batch routes"]
     gives_way_to: Int[Array, "*batch routes"]
     branching: Bool[Array, "*batch routes points"]
+    curvature: Float[Array, "*batch routes points"]
     end: Float[Array, "*batch routes"]
     dropped: Int[Array, "*batch"]
 
@@ -133,6 +135,7 @@ def _one_route(scene: LoggedScene, lanes: Int[Array, "depth"], start: Pose, opti
         give_way=give_way,
         gives_way_to=jnp.where(jnp.any(giving), road.gives_way[lanes[yielding]], 0),
         branching=branch[index] & (origin + stations <= polyline_length(line)),
+        curvature=curvature(path, SPACING),
         end=polyline_length(line) - origin,
         dropped=jnp.zeros((), int),
     )
