@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from flax import nnx
 from jax import random
 from learning import CLOSED_LOOP, ON_SCENE, SCENE, begin, experts, learner
 
@@ -16,7 +17,9 @@ from rtc_mjx.learner import Played, gradients, train_step
 from rtc_mjx.losses import LOSSES, Case, LossWeights
 from rtc_mjx.methods import METHODS
 from rtc_mjx.models import Networks
+from rtc_mjx.networks import Encoder, Layout, Reader, Scores
 from rtc_mjx.rollout import rollout
+from rtc_mjx.scenes import ItemSet
 
 NOTHING = LossWeights(**{f.name: 0.0 for f in dataclasses.fields(LossWeights) if isinstance(f.default, float)}, adversarial_ramp=0)
 ENCODING = tuple(name for name in ON_SCENE if METHODS[name].encodes)
@@ -192,7 +195,7 @@ def test_discriminator_never_sees_the_type(method):
     """Its input is state and action, whatever the method's types."""
     held = learner(method)
     state, batch = begin(held)
-    first = state.networks.discriminator.layers[0].kernel
+    first = state.networks.discriminator.head.layers[0].kernel
     assert first.shape[0] == batch.trajectory.observations.shape[-1] + batch.trajectory.actions.shape[-1]
 
 
@@ -209,7 +212,7 @@ def test_info_mgail_clones_under_the_type_that_q_infers():
     state, batch = begin(held)
     one = jax.tree.map(lambda x: x[0], batch)
     sure = jax.tree.map(jnp.zeros_like, state.networks.inference)
-    sure.layers[-1].bias = type(sure.layers[-1].bias)(jnp.array([0.0, 0.0, 5.0, 0.0]))
+    sure.head.layers[-1].bias = type(sure.head.layers[-1].bias)(jnp.array([0.0, 0.0, 5.0, 0.0]))
     agent = held.agent(dataclasses.replace(state.networks, inference=sure))
     drawn = [SOURCES["inference"](agent, one, k).agent_type for k in random.split(random.key(0), 50)]
     assert np.mean([g[2] for g in drawn]) > 0.95
@@ -298,3 +301,25 @@ def test_cloning_loss_by_hand():
     assert float(lost) == pytest.approx(
         np.mean(np.sum(0.5 * (actions / scale) ** 2 + np.log(scale) + 0.5 * np.log(2 * np.pi), axis=1)), rel=1e-5
     )
+
+
+def test_networks_do_not_care_in_which_order_items_come():
+    layout = Layout(3, (ItemSet("first", 4, 5), ItemSet("second", 2, 3)), 2)
+    x = random.normal(random.key(0), (3 + 20 + 6 + 2,))
+    x = x.at[jnp.array([3, 8, 13, 23])].set(1.0).at[jnp.array([18, 26])].set(0.0)  # three items there in the first set, one in the second
+    items = x[3:23].reshape(4, 5)
+    turned = x.at[3:23].set(items[jnp.array([2, 0, 3, 1])].reshape(-1))
+    for network in (Reader(layout, [8, 8], 6, nnx.Rngs(0)), Encoder(layout, 6, 8, 2, nnx.Rngs(0))):
+        read = (lambda v, n=network: n(v[None])) if isinstance(network, Encoder) else network
+        assert np.allclose(read(x), read(turned), atol=1e-6)
+        assert not np.allclose(read(x), read(x.at[4].add(1.0)), atol=1e-4)
+    scores = Scores(layout, 8, nnx.Rngs(0))
+    assert np.allclose(scores(x)[jnp.array([2, 0, 3, 1])], scores(turned), atol=1e-6) and scores(x)[3] < -20
+
+
+def test_a_set_without_items_says_nothing():
+    layout = Layout(1, (ItemSet("only", 2, 3),), 0)
+    empty = jnp.zeros(7).at[0].set(0.3)
+    network = Reader(layout, [8], 2, nnx.Rngs(0))
+    assert np.all(np.isfinite(jax.grad(lambda v: jnp.sum(network(v)))(empty)))
+    assert np.all(np.isfinite(network(empty))) and not np.allclose(network(empty), network(empty.at[4].set(1.0)))

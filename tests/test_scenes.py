@@ -87,7 +87,7 @@ def test_a_rollout_is_a_function_of_its_inputs(scene):
 
 
 def test_rollout_matches_c_mujoco(scene, x64):
-    held = jax.tree.map(lambda x: np.asarray(x[1], np.float64), experts(scene.name))
+    held = jax.tree.map(lambda x: x[1].astype(float) if x.dtype.kind == "f" else x[1], experts(scene.name))
     track = rollout(scene, playback(scene, held.trajectory.actions), held.episode)
     model = copy.copy(scene.world.mj)
     for mocap, (long, wide) in enumerate(held.episode.surroundings.size[0]):
