@@ -171,7 +171,7 @@ def from_command_line(argv: Sequence[str], prog: str) -> Config:
 def defaults(scene: str, method: str) -> Config:
     """The settings of a scene and a method, as committed."""
     config = Config(scene=scene_type(scene)(), method=method)
-    file = configs() / f"{scene}.toml"
+    file = configs() / f"{config.scene.settings or scene}.toml"
     if not file.is_file():
         return config
     try:

@@ -27,10 +27,16 @@ TRAIN, TEST, SECOND_TEST = 0, 1, 2  # seeds of the independent sets: to learn fr
 CHUNK = 1024  # episodes simulated at once
 
 
-def demonstrate(scene: Scene, key: jax.Array) -> Demonstration:
-    """One episode driven by the scene's expert."""
+def demonstrate(scene: Scene, key: jax.Array, change: Callable[[Episode], Episode | None] = lambda episode: episode) -> Demonstration:
+    """One episode driven by the scene's expert, after a change to it.
+
+    Raises:
+        UsageError: the scene has nothing to change.
+    """
     outside, inside = jax.random.split(key)
-    episode = scene.reset(outside)
+    episode = change(scene.reset(outside))
+    if episode is None:
+        raise UsageError(f"scene {scene.name} has nothing to change")
     actor, truth = scene.expert(inside, episode)
     return Demonstration(episode, rollout(scene, actor, episode), truth)
 
@@ -61,18 +67,8 @@ def redriven(scene: Scene, count: int, seed: int, change: Callable[[Episode], Ep
     Raises:
         UsageError: the scene has nothing to change.
     """
-
-    def one(key: jax.Array) -> Demonstration:
-        outside, inside = jax.random.split(key)
-        episode = scene.reset(outside)
-        changed = change(episode)
-        if changed is None:
-            raise UsageError(f"scene {scene.name} has nothing to change")
-        actor, _ = scene.expert(inside, changed)
-        return Demonstration(changed, rollout(scene, actor, changed), ())
-
     keys = jax.random.split(stream("demonstrations", seed), count)
-    return jax.jit(lambda keys: jax.lax.map(one, keys, batch_size=min(count, CHUNK)))(keys)
+    return jax.jit(lambda keys: jax.lax.map(lambda key: demonstrate(scene, key, change), keys, batch_size=min(count, CHUNK)))(keys)
 
 
 def fingerprint(scene: Scene, count: int, seed: int) -> str:

@@ -65,8 +65,7 @@ def roller(learner: Learner) -> Roll:
         count, samples = jax.tree.leaves(test)[0].shape[0], learner.scene.samples
         other = jax.tree.map(lambda x: jnp.roll(x, 1, axis=0), test)
         several = jax.vmap(functools.partial(one, networks), in_axes=(None, None, 0))
-        keys = random.split(key, count) if samples == 1 else random.split(key, (count, samples))
-        inputs = (test, other, keys.reshape(count, samples))
+        inputs = (test, other, random.split(key, (count, samples)))
         features = lax.map(lambda held: several(*held), inputs, batch_size=min(count, max(1, AT_ONCE // samples)))
         return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), features)
 

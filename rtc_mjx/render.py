@@ -57,8 +57,8 @@ def rollouts(run: Run, episodes: int, types: int, seed_index: int) -> tuple[Demo
     return shown, jax.device_get(jax.jit(jax.vmap(inner))(dataset.without_truth(shown), keys))
 
 
-def stage(scene: Scene, episode: Episode, actors: int, ghosts: bool, marks: int, size: tuple[int, int]) -> mujoco.MjModel:
-    """The dressed world with marks for everyone's trail, and a copy of the agent's body for each actor but the first if `ghosts`."""
+def stage(scene: Scene, episode: Episode, actors: int, marks: int, size: tuple[int, int]) -> mujoco.MjModel:
+    """The dressed world with marks for trails, and a ghost of the agent for each actor but the first unless shown side by side."""
     spec = scene.world.spec.copy()
     spec.visual.global_.offheight, spec.visual.global_.offwidth = size  # of what OpenGL draws into
     scene.dress(spec, episode)
@@ -66,7 +66,7 @@ def stage(scene: Scene, episode: Episode, actors: int, ghosts: bool, marks: int,
     for geom in [g for g in original.geoms if not scene.side_by_side or g.name.endswith("/body")]:
         geom.material, geom.rgba = "", [*EXPERT, 1]
     for actor in range(actors):
-        if actor and ghosts:
+        if actor and not scene.side_by_side:
             ghost = spec.worldbody.add_body(name=f"ghost{actor}", mocap=True)
             for g in original.geoms:
                 ghost.add_geom(
@@ -106,7 +106,7 @@ def pictures(run: Run, shown: Demonstration, tracks: Trajectory, camera_name: st
         episode = jax.tree.map(lambda x, i=index: np.asarray(x[i]), shown.episode)
         driven = [np.asarray(shown.trajectory.states.qpos[index]), *np.asarray(tracks.states.qpos[index])]
         paths = [poses(scene.world, scene.agent_body, qpos) for qpos in driven]
-        model = stage(scene, episode, 2 if scene.side_by_side else actors, not scene.side_by_side, marks, size)
+        model = stage(scene, episode, 2 if scene.side_by_side else actors, marks, size)
         data, take = mujoco.MjData(model), camera(model, camera_name, *size)
         for time in range(scene.steps + 1):
             scene.paint(model, episode, time)

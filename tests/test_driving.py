@@ -19,7 +19,7 @@ from rtc_mjx.models import ModelOptions
 from rtc_mjx.physics import PhysicsState, specialised_step, substates
 from rtc_mjx.rollout import rollout
 from rtc_mjx.scenes import SCENES, Actor, split_items
-from rtc_mjx.scenes.driving import AWAY, CAR, OWN, Driving, nearest_users, ran_red
+from rtc_mjx.scenes.driving import AWAY, CAR, OWN, Driving, crossings, nearest_users, ran_red
 from rtc_mjx.scenes.intersection import cycle
 from rtc_mjx.scenes.routes import BEHIND, NOWHERE, RouteOptions, find_routes
 from rtc_mjx.scenes.traffic import Drivers, Walkers, drive, follow_the_leader, must_stop, slow_for_bends, walk
@@ -343,9 +343,9 @@ def test_running_a_red_light_is_crossing_its_line_while_it_is_red():
         signals = jnp.zeros((91, 2), int).at[:, 1].set(state)
         episode = made("intersection").episode(dataclasses.replace(log, signals=signals))
         qpos = played(made("intersection"), episode, line(made("intersection"), [70.0, 0.0], [130.0, 0.0])).states.qpos
-        assert bool(ran_red(episode.context.routes, qpos)) is expected
+        assert bool(ran_red(episode.context.routes, crossings(episode.context.routes, qpos))) is expected
         before = played(made("intersection"), episode, line(made("intersection"), [20.0, 0.0], [97.0, 0.0])).states.qpos
-        assert not ran_red(episode.context.routes, before)
+        assert not ran_red(episode.context.routes, crossings(episode.context.routes, before))
 
 
 def test_flipped_signals_are_met_by_the_same_experts_with_the_same_minds(tmp_path, monkeypatch):

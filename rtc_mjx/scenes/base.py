@@ -71,6 +71,7 @@ class Scene(abc.ABC):
     """
 
     name: ClassVar[str]
+    settings: ClassVar[str] = ""  # the scene whose configs/<name>.toml it shares, if it has none of its own
     substeps: ClassVar[int] = 1
     main_metrics: ClassVar[tuple[str, ...]] = ()
     agent_body: ClassVar[str] = "agent"

@@ -152,7 +152,8 @@ def first_clash(way: Array, grid: Array, users: Array, speed: Array, route: Arra
     People on foot always go first. Vehicles do where the route gives way, until it is clear of them.
     """
     mine = (-speed + jnp.sqrt(speed**2 + 2 * 1.5 * grid)) / 1.5
-    mine = jnp.maximum(mine, grid / jnp.where(route[9] > 1.5, 4.5, 7.0))
+    joins = route[9] > 1.5  # a stream of others, and needs room to get up to its speed
+    mine = jnp.maximum(mine, grid / jnp.where(joins, 4.5, 7.0))
     after = jnp.array(AFTER)
     entry = jnp.argmin(jnp.abs(grid - (route[8] + ENTERED)))
 
@@ -170,12 +171,10 @@ def first_clash(way: Array, grid: Array, users: Array, speed: Array, route: Arra
         spots = user[1:3] + expected(user[5:7], user[10], after)
         reach = jnp.where(walks, CROSSES["walker"], CROSSES["vehicle"])
         meets = jnp.sqrt(jnp.sum((way[:, None] - spots) ** 2, axis=-1)) < reach  # (grid, after)
-        joins = route[9] > 1.5  # who joins a stream needs room to get up to its speed
         early, late = jnp.where(walks, 1.2, margin + jnp.where(joins, 1.0, 0.0)), jnp.where(walks, 1.0, 0.8)
         when = (after > mine[:, None] - late - 0.4) & (after < mine[:, None] + early)
         same_way = jnp.sum(user[5:7] * jnp.array([1.0, 0.0])) > 0.8 * jnp.sqrt(jnp.sum(user[5:7] ** 2) + 1e-6)
-        everybody = (route[9] > 1.5) & (route[8] > PASSED)
-        goes_first = walks | everybody | ((route[9] > 0.5) & (route[9] < 1.5) & ~same_way)
+        goes_first = walks | jnp.where(joins, route[8] > PASSED, (route[9] > 0.5) & ~same_way)
         clashes = jnp.any(meets & when, axis=1) | (joins & beats_me_there(user) & (jnp.arange(len(grid)) == entry))
         return jnp.where((user[0] > 0) & moving & goes_first & jnp.any(clashes), grid[jnp.argmax(clashes)] - reach, 1e3)
 

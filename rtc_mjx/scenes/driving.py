@@ -228,6 +228,7 @@ class Driving(Scene):
         road, qpos = episode.context, trajectory.states.qpos
         touch, overlap = self.encounters(episode, trajectory)
         past = jax.vmap(lambda q: jnp.any(past_edges(q[:3], road.graph) > 0))(qpos)
+        crossed = crossings(road.routes, qpos)
         bend, branching = jax.vmap(lambda q: _bend(road.routes, q[:2]))(qpos)
         return {
             "collision": jnp.any(touch & ~road.ghosts),
@@ -237,8 +238,8 @@ class Driving(Scene):
             "progress": jnp.sqrt(jnp.sum((qpos[-1] - qpos[0])[:2] ** 2)),
             "curvature": bend,
             "branching": branching,
-            "ran_red": ran_red(road.routes, qpos),
-            "decided": jnp.any(jnp.any(crossings(road.routes, qpos), axis=1)),
+            "ran_red": ran_red(road.routes, crossed),
+            "decided": jnp.any(crossed),
         }
 
     def encounters(self, episode: Episode, trajectory: Trajectory) -> tuple[Bool[Array, "users"], Bool[Array, "users"]]:
@@ -383,7 +384,7 @@ def crossings(routes: Routes, qpos: Float[Array, "times 4"]) -> Bool[Array, "rou
     return jax.vmap(one)(routes.paths, routes.stop) & routes.valid[:, None]
 
 
-def ran_red(routes: Routes, qpos: Float[Array, "times 4"]) -> Bool[Array, ""]:
-    """Whether the car's nose crossed a stop line while its signal was red."""
+def ran_red(routes: Routes, crossed: Bool[Array, "routes steps"]) -> Bool[Array, ""]:
+    """Whether a stop line was crossed while its signal was red."""
     red = (routes.signals[:-1] == RED) & (routes.signals[1:] == RED)
-    return jnp.any(crossings(routes, qpos) & red.T)
+    return jnp.any(crossed & red.T)

@@ -5,22 +5,19 @@ its route, speed, headway, how large a gap it takes and how late it looks (`rtc_
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 from jax import random
 from jaxtyping import Array, Float, Int
 
-from rtc_mjx.geometry import polyline_length, resample, rotate
+from rtc_mjx.geometry import resample, rotate
 from rtc_mjx.logs import AMBER, GREEN, NO_SIGNAL, PEDESTRIAN, RATE, RED, VEHICLE, LoggedScene, RoadGraph
-from rtc_mjx.scenes.base import Actor
-from rtc_mjx.scenes.driver import expert_driver
-from rtc_mjx.scenes.driving import CAR, CONTROL_EVERY, Driving
-from rtc_mjx.scenes.generated import assemble, moving
-from rtc_mjx.scenes.roads import POINTS, arc, ring_edges, straight
+from rtc_mjx.scenes.driving import CAR
+from rtc_mjx.scenes.generated import Generated, Others, assemble, moving
+from rtc_mjx.scenes.roads import POINTS, arc, ring_edges, straight, thinned
 from rtc_mjx.scenes.traffic import Drivers, Walkers, drive, walk
-from rtc_mjx.trajectory import Episode
 
 LANE_WIDTH = (3.3, 3.8)  # m
 CORNER = (7.0, 11.0)  # m, radius of a kerb
@@ -32,14 +29,13 @@ BACK = (4.0, 40.0)  # m, the agent's nose from its stop line at t = 0
 SPEED = (7.0, 13.0)  # m/s, what drivers want on a free road
 SOUTH, EAST, NORTH, WEST = 0, 1, 2, 3
 LEFT, STRAIGHT, RIGHT = 0, 1, 2
-LEAD, ONCOMING, CROSSING = slice(0, 2), slice(2, 4), slice(4, 6)
-PRESENT = (0.45, 0.25, 0.75, 0.6, 0.7, 0.7)  # of the vehicles above
+PRESENT = (0.45, 0.25, 0.75, 0.6, 0.7, 0.7)  # of two in front of the agent, two oncoming, two crossing
 WALKING = (0.4, 0.4)
 BRAKES_HARD = 0.2  # of the cars in front of the agent
 
 
 @dataclass(frozen=True)
-class Intersection(Driving):
+class Intersection(Generated):
     """Settings of the intersection.
 
     Attributes:
@@ -48,6 +44,7 @@ class Intersection(Driving):
     """
 
     name: ClassVar[str] = "intersection"
+    speeds: ClassVar[tuple[float, float]] = SPEED
 
     def log(self, key: jax.Array) -> LoggedScene:
         """Road, signals, traffic; the agent itself at t = 0 only."""
@@ -55,16 +52,12 @@ class Intersection(Driving):
         one, two = random.split(shape)
         width = random.uniform(one, minval=LANE_WIDTH[0], maxval=LANE_WIDTH[1])
         corner = random.uniform(two, minval=CORNER[0], maxval=CORNER[1])
-        times = CONTROL_EVERY * self.steps + 1
+        times = self.logged_times
         road = four_way(width, corner)
         ahead, across = cycle(lights, times)
         pose, speed = approach(own, width, corner, ahead[0])
         others = traffic(who, road, width, corner, ahead, across, pose, speed, times)
         return assemble(road, lane_signals(ahead, across), pose, speed, others, times)
-
-    def expert(self, key: jax.Array, episode: Episode) -> tuple[Actor, Any]:
-        """A driver with a route and a temper of its own."""
-        return expert_driver(key, self, episode, SPEED)
 
 
 def mouth(width: Array, corner: Array) -> Array:
@@ -82,7 +75,7 @@ def four_way(width: Array, corner: Array) -> RoadGraph:
     left = jnp.concatenate([enter, arc(jnp.array([-bend, -bend]), bend + half, 0.0, jnp.pi / 2), leave])
     right = jnp.concatenate([enter, arc(jnp.array([bend, -bend]), bend - half, jnp.pi, -jnp.pi / 2), jnp.array([[far, -half]])])
     on = straight(jnp.array([half, -far]), jnp.array([half, far]))
-    one_arm = jnp.stack([lane_in, lane_out, *(resample(x, jnp.linspace(0, polyline_length(x), POINTS)) for x in (left, on, right))])
+    one_arm = jnp.stack([lane_in, lane_out, *(thinned(x, POINTS) for x in (left, on, right))])
     lanes = jnp.concatenate([rotate(one_arm, jnp.array(arm * jnp.pi / 2)) for arm in range(4)])
     successors = jnp.full((20, 3), -1)
     for arm in range(4):
@@ -127,8 +120,8 @@ def approach(key: jax.Array, width: Array, corner: Array, signal: Array) -> tupl
 
 def traffic(
     key: jax.Array, road: RoadGraph, width: Array, corner: Array, ahead: Array, across: Array, pose: Array, speed: Array, times: int
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Poses (users, times, 3), velocities, sizes, kinds and presence of all but the agent."""
+) -> Others:
+    """Poses (users, times, 3), velocities, sizes and kinds of all but the agent."""
     keys = iter(random.split(key, 12))
     arms = jnp.array([SOUTH, SOUTH, NORTH, NORTH, EAST, WEST])
     ways = jnp.where(random.bernoulli(next(keys), 0.7, (6,)), STRAIGHT, RIGHT)
@@ -160,7 +153,6 @@ def traffic(
     drivers = Drivers(
         paths=paths, station=station, speed=start, desired=desired, headway=random.uniform(next(keys), (6,), minval=1.0, maxval=1.8),
         length=length, leader=jnp.where(present[leaders], leaders, -1),  # nobody follows a vehicle that is not there
-
         until=jnp.where((ways == ways[jnp.array([1, 0, 3, 2, 4, 5])]), 1e3, nose + 4.0),
         stop=jnp.full(6, nose), signals=signals,
         brakes=jnp.where(hard, random.uniform(next(keys), (6,), minval=0.5, maxval=6.0), 1e3),

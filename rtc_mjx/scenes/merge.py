@@ -4,7 +4,7 @@ External, xi: who drives on the road, how fast and how far apart. Internal to th
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -13,14 +13,11 @@ from jaxtyping import Array
 
 from rtc_mjx.geometry import resample
 from rtc_mjx.logs import NO_SIGNAL, VEHICLE, LoggedScene, RoadGraph
-from rtc_mjx.scenes.base import Actor
-from rtc_mjx.scenes.driver import expert_driver
-from rtc_mjx.scenes.driving import CAR, CONTROL_EVERY, Driving
-from rtc_mjx.scenes.generated import assemble, moving
-from rtc_mjx.scenes.roads import as_segments, beside, bezier, straight, thinned
+from rtc_mjx.scenes.driving import CAR
+from rtc_mjx.scenes.generated import Generated, Others, assemble, moving
+from rtc_mjx.scenes.roads import POINTS, as_segments, beside, bezier, straight, thinned
 from rtc_mjx.scenes.routes import RouteOptions
-from rtc_mjx.scenes.traffic import Drivers, drive
-from rtc_mjx.trajectory import Episode
+from rtc_mjx.scenes.traffic import Drivers, drive, nothing_to_stop_for
 
 WIDTH = 4.0  # m, of a lane
 ANGLE = (0.2, 0.32)  # rad, between ramp and road
@@ -34,7 +31,7 @@ UPSTREAM, RAMP_LANE, JOINING, BETWEEN, ONWARD, LEAVING = range(6)
 
 
 @dataclass(frozen=True)
-class Merge(Driving):
+class Merge(Generated):
     """Settings of the merge.
 
     Attributes:
@@ -43,12 +40,14 @@ class Merge(Driving):
     """
 
     name: ClassVar[str] = "merge"
+    speeds: ClassVar[tuple[float, float]] = SPEED
+    settings: ClassVar[str] = "intersection"
     route_options: ClassVar[RouteOptions] = RouteOptions(count=2, lanes=4)
 
     def log(self, key: jax.Array) -> LoggedScene:
         """Road and traffic; the agent itself at t = 0 only."""
         shape, who, place, pace = random.split(key, 4)
-        times = CONTROL_EVERY * self.steps + 1
+        times = self.logged_times
         angle = random.uniform(shape, minval=ANGLE[0], maxval=ANGLE[1])
         road = ramp(angle)
         back = random.uniform(place, minval=BACK[0], maxval=BACK[1]) + CAR[0] / 2
@@ -57,10 +56,6 @@ class Merge(Driving):
         pose = jnp.concatenate([end - back * jnp.stack([jnp.cos(angle), jnp.sin(angle)]), angle[None]])
         signals = jnp.full((times, road.lanes.shape[0]), NO_SIGNAL)
         return assemble(road, signals, pose, speed, traffic(who, road, times), times)
-
-    def expert(self, key: jax.Array, episode: Episode) -> tuple[Actor, Any]:
-        """A driver with a way and a temper of its own."""
-        return expert_driver(key, self, episode, SPEED)
 
 
 def ramp(angle: Array) -> RoadGraph:
@@ -77,7 +72,7 @@ def ramp(angle: Array) -> RoadGraph:
         bezier(foot, angle, jnp.zeros(2), zero, JOIN / 3),
         straight(jnp.zeros(2), fork),
         straight(fork, fork + jnp.array([ROAD, 0.0])),
-        thinned(leaving, 24),
+        thinned(leaving, POINTS),
     ])  # fmt: skip
     successors = jnp.array([[BETWEEN, -1], [JOINING, -1], [BETWEEN, -1], [ONWARD, LEAVING], [-1, -1], [-1, -1]])
     right = jnp.concatenate([lanes[RAMP_LANE], lanes[JOINING][1:], lanes[BETWEEN][1:], lanes[LEAVING][1:]])
@@ -86,8 +81,8 @@ def ramp(angle: Array) -> RoadGraph:
     return RoadGraph(lanes, successors, jnp.array([0, 0, 2, 0, 0, 0]), edges, jnp.ones(len(edges), bool), jnp.zeros((1, 4, 2)))
 
 
-def traffic(key: jax.Array, road: RoadGraph, times: int) -> tuple[Array, Array, Array, Array, Array]:
-    """Poses, velocities, sizes, kinds and presence of a line of vehicles on the road."""
+def traffic(key: jax.Array, road: RoadGraph, times: int) -> Others:
+    """Poses, velocities, sizes and kinds of a line of vehicles on the road."""
     keys = iter(random.split(key, 7))
     count = 6
     line = jnp.concatenate([road.lanes[UPSTREAM], road.lanes[BETWEEN][1:], road.lanes[ONWARD][1:]])
@@ -101,8 +96,7 @@ def traffic(key: jax.Array, road: RoadGraph, times: int) -> tuple[Array, Array, 
         paths=paths, station=ahead - jnp.cumsum(gaps), speed=jnp.full(count, flow),
         desired=flow * random.uniform(next(keys), (count,), minval=0.9, maxval=1.05), headway=jnp.full(count, 1.2),
         length=random.uniform(next(keys), (count,), minval=4.0, maxval=5.2), leader=jnp.arange(count) - 1,
-        until=jnp.full(count, ROAD + MIDDLE), stop=jnp.full(count, 1e4), signals=jnp.full((times, count), NO_SIGNAL),
-        brakes=jnp.full(count, 1e3), brakes_for=jnp.zeros(count),
+        until=jnp.full(count, ROAD + MIDDLE), **nothing_to_stop_for(count, times),
     )  # fmt: skip
     present = random.bernoulli(next(keys), 0.8, (count,))
     poses, speeds = drive(drivers, 2.0, times)

@@ -4,7 +4,7 @@ External, xi: who circulates and how fast. Internal to the expert: the exit, its
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -13,14 +13,11 @@ from jaxtyping import Array
 
 from rtc_mjx.geometry import resample, rotate
 from rtc_mjx.logs import NO_SIGNAL, VEHICLE, LoggedScene, RoadGraph
-from rtc_mjx.scenes.base import Actor
-from rtc_mjx.scenes.driver import expert_driver
-from rtc_mjx.scenes.driving import CAR, CONTROL_EVERY, Driving
-from rtc_mjx.scenes.generated import assemble, moving
-from rtc_mjx.scenes.roads import as_segments, beside, bezier, straight, thinned
+from rtc_mjx.scenes.driving import CAR
+from rtc_mjx.scenes.generated import Generated, Others, assemble, moving
+from rtc_mjx.scenes.roads import arc, as_segments, beside, bezier, straight, thinned
 from rtc_mjx.scenes.routes import RouteOptions
-from rtc_mjx.scenes.traffic import Drivers, drive
-from rtc_mjx.trajectory import Episode
+from rtc_mjx.scenes.traffic import Drivers, drive, nothing_to_stop_for
 
 WIDTH = 4.2  # m, of a lane
 RING = (12.0, 15.0)  # m, radius of the ring's centre line
@@ -37,7 +34,7 @@ PRESENT = (0.75, 0.65, 0.5, 0.6, 0.6)
 
 
 @dataclass(frozen=True)
-class Roundabout(Driving):
+class Roundabout(Generated):
     """Settings of the roundabout.
 
     Attributes:
@@ -46,12 +43,14 @@ class Roundabout(Driving):
     """
 
     name: ClassVar[str] = "roundabout"
+    speeds: ClassVar[tuple[float, float]] = SPEED
+    settings: ClassVar[str] = "intersection"
     route_options: ClassVar[RouteOptions] = RouteOptions(lanes=9)
 
     def log(self, key: jax.Array) -> LoggedScene:
         """Road and traffic; the agent itself at t = 0 only."""
         shape, who, place, pace = random.split(key, 4)
-        times = CONTROL_EVERY * self.steps + 1
+        times = self.logged_times
         radius = random.uniform(shape, minval=RING[0], maxval=RING[1])
         road = ring(radius)
         back = random.uniform(place, minval=BACK[0], maxval=BACK[1])
@@ -59,10 +58,6 @@ class Roundabout(Driving):
         pose = jnp.stack([jnp.array(WIDTH / 2), -radius - MOUTH - back - CAR[0] / 2, jnp.array(jnp.pi / 2)])
         signals = jnp.full((times, road.lanes.shape[0]), NO_SIGNAL)
         return assemble(road, signals, pose, speed, traffic(who, road, times), times)
-
-    def expert(self, key: jax.Array, episode: Episode) -> tuple[Actor, Any]:
-        """A driver with an exit and a temper of its own."""
-        return expert_driver(key, self, episode, SPEED)
 
 
 def ring(radius: Array) -> RoadGraph:
@@ -72,17 +67,13 @@ def ring(radius: Array) -> RoadGraph:
     def on_ring(bearing: Array) -> Array:
         return radius * jnp.stack([jnp.cos(bearing), jnp.sin(bearing)])
 
-    def along(start: float, end: float) -> Array:
-        bearing = jnp.linspace(start, end, 24)
-        return radius * jnp.stack([jnp.cos(bearing), jnp.sin(bearing)], axis=1)
-
     south = -quarter
     joins, leaves = jnp.array(south + FLARE), jnp.array(south - FLARE)
     lanes = [
         straight(jnp.stack([jnp.array(half), -mouth - ARM]), jnp.stack([jnp.array(half), -mouth])),
         bezier(jnp.stack([jnp.array(half), -mouth]), jnp.array(quarter), on_ring(joins), joins + quarter, 0.45 * MOUTH),
-        along(south + FLARE, south + quarter - FLARE),
-        along(south - FLARE, south + FLARE),
+        arc(jnp.zeros(2), radius, south + FLARE, quarter - 2 * FLARE),
+        arc(jnp.zeros(2), radius, south - FLARE, 2 * FLARE),
         bezier(on_ring(leaves), leaves + quarter, jnp.stack([jnp.array(-half), -mouth]), jnp.array(-quarter), 0.45 * MOUTH),
         straight(jnp.stack([jnp.array(-half), -mouth]), jnp.stack([jnp.array(-half), -mouth - ARM])),
     ]
@@ -111,8 +102,8 @@ def ring(radius: Array) -> RoadGraph:
     return RoadGraph(every, successors, gives_way, edges, jnp.ones(len(edges), bool), jnp.zeros((1, 4, 2)))
 
 
-def traffic(key: jax.Array, road: RoadGraph, times: int) -> tuple[Array, Array, Array, Array, Array]:
-    """Poses, velocities, sizes, kinds and presence of those who circulate: from the west past the agent's entry, and elsewhere."""
+def traffic(key: jax.Array, road: RoadGraph, times: int) -> Others:
+    """Poses, velocities, sizes and kinds of those who circulate: from the west past the agent's entry, and elsewhere."""
     keys = iter(random.split(key, 6))
     count, arms = len(FROM), jnp.array(FROM)
 
@@ -133,8 +124,7 @@ def traffic(key: jax.Array, road: RoadGraph, times: int) -> tuple[Array, Array, 
     drivers = Drivers(
         paths=paths, station=station, speed=desired, desired=desired,
         headway=random.uniform(next(keys), (count,), minval=1.0, maxval=1.8), length=length, leader=jnp.array([-1, 0, 1, -1, -1]),
-        until=jnp.full(count, 1e3), stop=jnp.full(count, 1e4), signals=jnp.full((times, count), NO_SIGNAL),
-        brakes=jnp.full(count, 1e3), brakes_for=jnp.zeros(count),
+        until=jnp.full(count, 1e3), **nothing_to_stop_for(count, times),
     )  # fmt: skip
     present = random.bernoulli(next(keys), jnp.array(PRESENT))
     poses, speeds = drive(drivers, 2.0, times)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rtc_mjx.scenes.driving import Road
 
 ASPHALT, SURFACE = (0.30, 0.31, 0.33), 1.9  # colour, and half the width in m
-KERB, LANE, STRIPE, ROUTE = (0.86, 0.86, 0.82), (0.62, 0.64, 0.60), (0.90, 0.90, 0.88), (0.55, 0.60, 0.80)
+KERB, LANE, STRIPE = (0.86, 0.86, 0.82), (0.62, 0.64, 0.60), (0.90, 0.90, 0.88)
 LIGHTS = {RED: (0.85, 0.16, 0.13), AMBER: (0.95, 0.70, 0.10), GREEN: (0.16, 0.66, 0.30), NO_SIGNAL: (0.5, 0.5, 0.5)}
 PERSON = (0.72, 0.22, 0.45)
 TALL = 0.9  # m, half the height of a person

@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from rtc_mjx.geometry import curvature, pose_at
-from rtc_mjx.logs import AMBER, RATE, RED
+from rtc_mjx.logs import AMBER, NO_SIGNAL, RATE, RED
 from rtc_mjx.pytree import pytree
 
 TICK = 1 / RATE  # s
@@ -52,6 +52,16 @@ class Drivers:
     signals: Int[Array, "times *n"]
     brakes: Float[Array, "*n"]
     brakes_for: Float[Array, "*n"]
+
+
+def nothing_to_stop_for(count: int, times: int) -> dict[str, Array]:
+    """The part of `Drivers` that says when they stop, where there are no signals and nobody brakes without a reason."""
+    return {
+        "stop": jnp.full(count, 1e4),
+        "signals": jnp.full((times, count), NO_SIGNAL),
+        "brakes": jnp.full(count, 1e3),
+        "brakes_for": jnp.zeros(count),
+    }
 
 
 @pytree
