@@ -54,11 +54,25 @@ def demonstrations(scene: Scene, count: int, seed: int) -> Demonstration:
     file = cache.folder() / "demonstrations" / f"{scene.name}-{fingerprint(scene, count, seed)}.npz"
     leaves = _read(file, jax.tree.leaves(shapes))
     if leaves is None:
-        keys = jax.random.split(stream("demonstrations", seed), count)
-        parts = [jax.device_get(make(keys[i : i + CHUNK])) for i in range(0, count, CHUNK)]
-        leaves = jax.tree.leaves(jax.tree.map(lambda *x: np.concatenate(x), *parts))
+        leaves = jax.tree.leaves(_made(make, count, seed, CHUNK))
         _write(file, leaves)
     return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
+
+
+def by_others(scene: Scene, count: int, seed: int, minds: int) -> Demonstration:
+    """The episodes of a seed, each driven by as many other experts: what else might have been done in them; leading axes (count, minds)."""
+
+    def again(key: jax.Array) -> Demonstration:
+        outside, inside = jax.random.split(key)
+        episode = scene.reset(outside)
+
+        def one(mind: jax.Array) -> Demonstration:
+            actor, truth = scene.expert(jax.random.fold_in(inside, mind), episode)
+            return Demonstration(episode, rollout(scene, actor, episode), truth)
+
+        return jax.vmap(one)(1 + jnp.arange(minds))
+
+    return _made(jax.jit(jax.vmap(again)), count, seed, max(1, CHUNK // minds))
 
 
 def redriven(scene: Scene, count: int, seed: int, change: Callable[[Episode], Episode | None]) -> Demonstration:
@@ -67,8 +81,14 @@ def redriven(scene: Scene, count: int, seed: int, change: Callable[[Episode], Ep
     Raises:
         UsageError: the scene has nothing to change.
     """
+    return _made(jax.jit(jax.vmap(lambda key: demonstrate(scene, key, change))), count, seed, CHUNK)
+
+
+def _made(make: Callable[[jax.Array], Demonstration], count: int, seed: int, at_once: int) -> Demonstration:
+    """What a function makes of the keys of a seed's episodes, as numpy arrays; so many at once as memory allows."""
     keys = jax.random.split(stream("demonstrations", seed), count)
-    return jax.jit(lambda keys: jax.lax.map(lambda key: demonstrate(scene, key, change), keys, batch_size=min(count, CHUNK)))(keys)
+    parts = [jax.device_get(make(keys[i : i + at_once])) for i in range(0, count, at_once)]
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 
 def fingerprint(scene: Scene, count: int, seed: int) -> str:

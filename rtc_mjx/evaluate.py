@@ -37,39 +37,41 @@ FINITE = "finite"  # the feature that says whether a rollout is
 Features = dict[str, np.ndarray]
 
 
-def type_sources(method: Method) -> tuple[str, ...]:
-    """Where test types may come from: the prior, and, where there is an encoder, demonstrations."""
-    return ("prior", "paired", "shuffled") if method.encodes else ("prior",)
+Donors = dict[str, Trajectory]  # the trajectory that each episode's type is inferred from, by source of types
+Roll = Callable[[Networks, Demonstration, Donors, Array], dict[str, dict[str, Array]]]
 
 
-Roll = Callable[[Networks, Demonstration, Array], dict[str, dict[str, Array]]]
+def donors(method: Method, test: Demonstration) -> Donors:
+    """What types are inferred from: an episode's own demonstration, or that of another; nothing where no type is inferred."""
+    if not method.encodes:
+        return {}
+    return {"paired": test.trajectory, "shuffled": jax.tree.map(lambda x: jnp.roll(x, 1, axis=0), test.trajectory)}
 
 
-def roller(learner: Learner) -> Roll:
-    """A compiled function (networks of all seeds, test demonstrations, key) -> features per type source, (seeds, samples, episodes)."""
-    sources = type_sources(learner.method)
+def roller(learner: Learner, samples: int) -> Roll:
+    """A compiled function (networks, test demonstrations, donors, key) -> features per type source, (seeds, samples, episodes).
 
-    def one(networks: Networks, mine: Demonstration, other: Demonstration, key: Array) -> dict[str, dict[str, Array]]:
+    Args:
+        learner: who is tested; the networks are those of all seeds.
+        samples: rollouts of each episode, every one with a type of its own.
+    """
+
+    def one(networks: Networks, mine: Demonstration, given: Donors, key: Array) -> dict[str, dict[str, Array]]:
         agent = learner.agent(networks)
         draw, noise = random.split(key)
-        inferred = functools.partial(SOURCES["encoder"], agent)
-        ways = {
-            "prior": lambda: SOURCES[learner.method.test_types](agent, mine, draw),
-            "paired": lambda: inferred(mine, draw),
-            "shuffled": lambda: inferred(other, draw),
-        }
-        tracks = {name: learner.play(agent, mine.episode, ways[name]().agent_type, noise) for name in sources}
+        types = {"prior": SOURCES[learner.method.test_types](agent, mine, draw)}
+        types |= {name: SOURCES["encoder"](agent, Demonstration(mine.episode, track, ()), draw) for name, track in given.items()}
+        tracks = {name: learner.play(agent, mine.episode, typed.agent_type, noise) for name, typed in types.items()}
         return {name: learner.scene.features(mine, track) | {FINITE: _finite(track)} for name, track in tracks.items()}
 
-    def all_episodes(networks: Networks, test: Demonstration, key: Array) -> dict[str, dict[str, Array]]:
-        count, samples = jax.tree.leaves(test)[0].shape[0], learner.scene.samples
-        other = jax.tree.map(lambda x: jnp.roll(x, 1, axis=0), test)
+    def all_episodes(networks: Networks, test: Demonstration, given: Donors, key: Array) -> dict[str, dict[str, Array]]:
+        count = jax.tree.leaves(test)[0].shape[0]
         several = jax.vmap(functools.partial(one, networks), in_axes=(None, None, 0))
-        inputs = (test, other, random.split(key, (count, samples)))
+        inputs = (test, given, random.split(key, (count, samples)))
         features = lax.map(lambda held: several(*held), inputs, batch_size=min(count, max(1, AT_ONCE // samples)))
         return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), features)
 
-    return jax.jit(lambda networks, test, key: lax.map(lambda held: all_episodes(held, test, key), networks))
+    return jax.jit(lambda networks, test, given, key: lax.map(lambda held: all_episodes(held, test, given, key), networks))
 
 
 def _finite(track: Trajectory) -> Array:
@@ -103,8 +105,9 @@ def evaluate(run: Run, episodes: int) -> dict[str, Any]:
     tests = [dataset.demonstrations(config.scene, episodes, seed) for seed in (dataset.TEST, dataset.SECOND_TEST)]
     learner = config.learner(dataset.statistics(config.scene, train))
     update, state, _ = run.restore(start_shapes(learner, config.all_seeds))
-    roll, shown = roller(learner), dataset.without_truth(tests[0])
-    features = jax.device_get(roll(state.networks, shown, stream("evaluation", 0)))
+    roll, shown = roller(learner, config.scene.samples), dataset.without_truth(tests[0])
+    given = donors(learner.method, shown)
+    features = jax.device_get(roll(state.networks, shown, given, stream("evaluation", 0)))
     expert, second = (expert_features(config, test) for test in tests)
     table = score(config, features, expert)
     means = {source: _summaries(config, features[source], expert, table[source]) for source in table}
@@ -116,7 +119,7 @@ def evaluate(run: Run, episodes: int) -> dict[str, Any]:
         "update": update,
         "metrics": means["prior"],
         "types": means,
-        "reaction": reaction(config, roll, state.networks, shown, features, expert),
+        "reaction": reaction(config, lambda held: roll(state.networks, held, given, stream("evaluation", 0)), shown, features, expert),
         "ranges": config.scene.ranges(expert),
         "notes": {what: count for what, count in config.scene.notes(tests[0].episode).items() if count},
         "reference": {"expert": config.scene.metrics(expert, expert), "expert_vs_expert": config.scene.metrics(second, expert)},
@@ -124,7 +127,7 @@ def evaluate(run: Run, episodes: int) -> dict[str, Any]:
 
 
 def reaction(
-    config: Config, roll: Roll, networks: Networks, shown: Demonstration, features: dict[str, Features], expert: Features
+    config: Config, roll: Callable[[Demonstration], Any], shown: Demonstration, features: dict[str, Features], expert: Features
 ) -> dict[str, dict[str, float]]:
     """What agents do when luck is turned round at the same type (method notes, section 7), beside the experts with the same minds.
 
@@ -138,7 +141,7 @@ def reaction(
     count = len(next(iter(expert.values())))
     again = dataset.without_truth(dataset.redriven(config.scene, count, dataset.TEST, config.scene.flipped))
     theirs = expert_features(config, again)["decided"]
-    flipped = jax.device_get(roll(networks, Demonstration(turned, shown.trajectory, ()), stream("evaluation", 0)))
+    flipped = jax.device_get(roll(Demonstration(turned, shown.trajectory, ())))
 
     def told(before: np.ndarray, after: np.ndarray) -> dict[str, float]:
         return {"as_it_was": float(np.mean(before)), "flipped": float(np.mean(after)), "like_expert": float(np.mean(after == theirs))}
@@ -194,7 +197,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     console.print(table(result))
     for who, shares in result["reaction"].items():
         told = ", ".join(f"{name.replace('_', ' ')} {share:.3f}" for name, share in shares.items())
-        console.print(f"signals flipped, {who}: {told}")
+        console.print(f"luck turned round, {who}: {told}")
     for what, count in result["notes"].items():
         console.print(f"{count} {what}")
     write_whole(run.folder / "evaluation.json", json.dumps(result, indent=1) + "\n")

@@ -137,6 +137,14 @@ def boxes_overlap(pose: Pose, size: Point, others: Float[Array, "n 3"], sizes: F
     return ~(apart(pose[2], size, sizes) | apart(others[:, 2], sizes, size))
 
 
+def closest_approach(
+    place: Float[Array, "*batch 2"], velocity: Float[Array, "*batch 2"], horizon: float
+) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+    """When, in s within the horizon, a point that goes straight on is closest to the origin, and how close, in m."""
+    soon = jnp.clip(-jnp.sum(place * velocity, axis=-1) / (jnp.sum(velocity**2, axis=-1) + 0.1), 0.0, horizon)
+    return soon, length(place + soon[..., None] * velocity)
+
+
 def off_road(point: Point, edges: Float[Array, "edges 2 2"], valid: Bool[Array, "edges"]) -> Float[Array, ""]:
     """Signed distance in m past the nearest road edge: positive off the road, negative on it. The road lies to an edge's left.
 

@@ -7,7 +7,7 @@ settings, and the versions and the commit of the code that reports.
 import argparse
 import json
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -43,14 +43,14 @@ def evaluation(run: Run) -> dict[str, Any]:
     return held
 
 
-def table(runs: Sequence[Run]) -> str:
-    """A Markdown table: a row a method, under prior types; paired and shuffled where there are such; the expert below."""
-    results = [evaluation(run) for run in runs]
+def table(runs: Mapping[str, Run]) -> str:
+    """A Markdown table of runs by name: a row under prior types; paired and shuffled where there are such; the expert below."""
+    results = [evaluation(run) for run in runs.values()]
     names = list(results[0]["metrics"])
     rows = [["method", "types", *names], ["---", "---", *["---:"] * len(names)]]
-    for result in results:
+    for label, result in zip(runs, results, strict=True):
         for source, summary in result["types"].items():
-            rows.append([result["method"], source, *(_cell(summary[name]) for name in names)])
+            rows.append([label, source, *(_cell(summary[name]) for name in names)])
     for who, values in results[0]["reference"].items():
         rows.append([who.replace("_", " "), "", *(f"{values[name]:.4g}" for name in names)])
     first = results[0]
@@ -145,7 +145,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         raise UsageError(f"one run a method is needed; there are {methods.count(twice[0])} of {twice[0]}")
     records = [record(run) for run in runs]
     options.out.mkdir(parents=True, exist_ok=True)
-    text = table(runs)
+    text = table(dict(zip(methods, runs, strict=True)))
     (options.out / "table.md").write_text(text)
     curves(runs, options.out / "curves.png")
     for held in records:

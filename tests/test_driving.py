@@ -1,7 +1,6 @@
 """Laws of every driving scene, of the road graph and the routes found in it, and of driving's metrics."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 from jax import random
+from made import demonstrated, made
 
 from rtc_mjx import dataset, evaluate, train
 from rtc_mjx.config import Config, Experts, Intervals
@@ -26,20 +26,6 @@ from rtc_mjx.scenes.traffic import Drivers, Walkers, drive, follow_the_leader, m
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
 DRIVING = tuple(name for name, scene in SCENES.items() if issubclass(scene, Driving))
-
-
-@functools.cache
-def made(name):
-    return SCENES[name]()
-
-
-@functools.cache
-def demonstrated(name, count=512):
-    """Demonstrations and their features."""
-    scene = made(name)
-    held = jax.jit(jax.vmap(lambda key: dataset.demonstrate(scene, key)))(random.split(random.key(5), count))
-    features = jax.jit(jax.vmap(lambda one: scene.features(one, one.trajectory)))(dataset.without_truth(held))
-    return jax.device_get(held), jax.device_get(features)
 
 
 @pytest.fixture(params=DRIVING)

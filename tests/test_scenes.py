@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import functools
 
 import dm_env
 import jax
@@ -13,6 +12,7 @@ import pytest
 from absl.testing import absltest
 from dm_env import test_utils
 from jax import random
+from made import demonstrated, made
 
 from rtc_mjx import dataset
 from rtc_mjx.environment import Environment
@@ -22,15 +22,8 @@ from rtc_mjx.scenes import SCENES, Actor, DoubleGoal, double_goal, scene_type, s
 from rtc_mjx.trajectory import Demonstration
 
 
-@functools.cache
-def made(name):
-    return SCENES[name]()
-
-
-@functools.cache
-def experts(name, count=512):
-    scene = made(name)
-    return jax.device_get(jax.jit(jax.vmap(lambda k: dataset.demonstrate(scene, k)))(random.split(random.key(5), count)))
+def experts(name):
+    return demonstrated(name)[0]
 
 
 @pytest.fixture(params=SCENES)
@@ -64,7 +57,7 @@ def test_experts_are_finite_and_differ(scene):
 
 
 def test_episodes_start_differently(scene):
-    start = experts(scene.name, 512).episode
+    start = experts(scene.name).episode
     assert any(np.std(x, axis=0).max() > 0 for x in jax.tree.leaves((start.start.qpos, start.surroundings.pose)))
 
 
@@ -108,8 +101,7 @@ def test_rollout_matches_c_mujoco(scene, x64):
 
 
 def test_features_and_metrics_are_finite_and_the_expert_equals_itself(scene):
-    held = experts(scene.name)
-    features = jax.device_get(jax.jit(jax.vmap(lambda one: scene.features(one, one.trajectory)))(dataset.without_truth(held)))
+    _, features = demonstrated(scene.name)
     result = scene.metrics(features, features)
     assert all(np.isfinite(v) for v in result.values()) and set(scene.main_metrics) <= set(result)
     assert all(v == 0 for name, v in result.items() if "jsd" in name)

@@ -78,6 +78,7 @@ class Scene(abc.ABC):
     samples: ClassVar[int] = 1  # rollouts of each test episode, every one with a type of its own
     mark_size: ClassVar[float] = 0.018  # m, radius of the marks that trails are made of in videos
     side_by_side: ClassVar[bool] = False  # whether a video shows each rollout in a picture of its own
+    described_by: ClassVar[tuple[str, ...]] = ()  # features by which trajectories of one episode are compared
     reconstructs_rollouts: ClassVar[bool] = False  # whether L_rec compares rollouts (`discrepancy`) rather than actions
     steps: int = field(default=60)
 
@@ -109,6 +110,10 @@ class Scene(abc.ABC):
     def notes(self, episodes: Episode) -> dict[str, int]:
         """What a reader of metrics on these episodes (leading axis) should know: what was left out or not counted, and how often."""
         return {}
+
+    @abc.abstractmethod
+    def luck(self, episode: Episode) -> Float[Array, "numbers"]:
+        """The episode's xi as a vector: what the episode has in store for the agent, seen from where it starts (analysis only)."""
 
     def flipped(self, episode: Episode) -> Episode | None:
         """The same episode with luck turned round (a red light green); None where there is nothing to turn.

@@ -5,6 +5,7 @@ bends. External, xi: where the goals are and how they drift. A type that knows w
 another one; a type that knows which goal was wanted is not.
 """
 
+import dataclasses
 import functools
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -48,6 +49,7 @@ class DoubleGoal(Scene):
 
     name: ClassVar[str] = "double_goal"
     main_metrics: ClassVar[tuple[str, ...]] = ("return", "jsd_goal")
+    described_by: ClassVar[tuple[str, ...]] = ("return", "upper", "left", "decided")
     steps: int = 60
     lower_probability: float = 0.75
 
@@ -97,11 +99,20 @@ class DoubleGoal(Scene):
 
         return Actor((), act, noise), {"goal": goal[-1], "bend": bend}
 
+    def luck(self, episode: Episode) -> Float[Array, "8"]:
+        """Where both goals are at first, and where at last, in m."""
+        return episode.surroundings.pose[np.array([0, -1]), :, :2].reshape(-1)
+
+    def flipped(self, episode: Episode) -> Episode:
+        """Both goals, and their drift, on the other side of x = 0: to go to one means to go there, not where it was."""
+        around = episode.surroundings
+        return dataclasses.replace(episode, surroundings=Surroundings(around.pose.at[..., 0].multiply(-1), around.size))
+
     def label(self, demonstration: Demonstration) -> None:
         """The double goal problem has no hand-made label: Symphony does not run on it."""
 
     def features(self, demonstration: Demonstration, trajectory: Trajectory) -> dict[str, Array]:
-        """Steps spent at either goal, the side on which the episode ends, h = sign(y_T) (paper, section V-A), and the way its path turns.
+        """Steps at either goal, the side at the end, h = sign(y_T) (paper, section V-A), the turn of the path, whether it ends at a goal.
 
         The turn is not in the paper: like the goal it is the expert's own choice, half left and half right, and a population has both.
         """
@@ -112,6 +123,7 @@ class DoubleGoal(Scene):
             "return": jnp.sum(rewards[1:]),
             "upper": (trajectory.states.qpos[-1, 1] > 0).astype(int),
             "left": (jnp.sum(turn[UNDECIDED : UNDECIDED + TURNING]) > 0).astype(int),
+            "decided": rewards[-1],
         }
 
     def metrics(self, features: dict[str, np.ndarray], expert: dict[str, np.ndarray]) -> dict[str, float]:

@@ -85,7 +85,7 @@ def steering(own: Array, route: Array, aside: Array) -> Float[Array, ""]:
 
 
 def pedals(
-    own: Array, route: Array, signal: Float[Array, "3"], users: Float[Array, "users 11"], truth: dict[str, Array]
+    own: Array, route: Array, signal: Float[Array, "3"], users: Float[Array, "users 14"], truth: dict[str, Array]
 ) -> Float[Array, ""]:
     """Acceleration in m/s^2."""
     speed = jnp.maximum(own[0], 0.0)

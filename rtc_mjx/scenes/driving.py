@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rtc_mjx import metrics
-from rtc_mjx.geometry import boxes_overlap, capsule_gap, corners, off_road, pose_at, project, rotate, wrapped
+from rtc_mjx.geometry import boxes_overlap, capsule_gap, closest_approach, corners, off_road, pose_at, project, rotate, wrapped
 from rtc_mjx.logs import AMBER, GREEN, PEDESTRIAN, RATE, RED, LoggedScene, RoadGraph
 from rtc_mjx.physics import PhysicsState, Surroundings, World, load, rest_state, specialised_step, substates
 from rtc_mjx.pytree import pytree
@@ -34,6 +34,7 @@ CONTROL_EVERY = 3  # logged times a control step: 10 Hz to 3.3 Hz
 OWN = 4  # numbers of an observation about the car itself
 AHEAD = (2.0, 5.0, 8.0, 12.0, 16.0, 20.0, 25.0, 30.0, 40.0, 50.0)  # m along a route, where it is looked at
 FAR = 60.0  # m, beyond which nothing is told apart
+NEAR, SOON = 15.0, 5.0  # m and s, up to which it is told how close somebody is or will be
 OFF_ROUTE = 5.0  # m to the side, beyond which a route is no longer one's own
 SAME_ROUTE = 0.05  # m, mean difference in distance from the path below which routes fit alike
 PAST = 1.0  # m past a stop line, from where it counts as crossed
@@ -86,6 +87,7 @@ class Driving(Scene):
     route_options: ClassVar[RouteOptions] = RouteOptions()
     samples: ClassVar[int] = SAMPLES
     reconstructs_rollouts: ClassVar[bool] = True
+    described_by: ClassVar[tuple[str, ...]] = ("collision", "offroad", "progress", "curvature", "decided", "ran_red")
     mark_size: ClassVar[float] = 0.3
     side_by_side: ClassVar[bool] = True
     steps: int = 30
@@ -109,7 +111,7 @@ class Driving(Scene):
     @property
     def sets(self) -> tuple[ItemSet, ...]:
         """After the car itself: the routes, then the road users."""
-        return (ItemSet("routes", self.route_options.count, 11 + 2 * len(AHEAD)), ItemSet("road_users", self.road_users, 11))
+        return (ItemSet("routes", self.route_options.count, 11 + 2 * len(AHEAD)), ItemSet("road_users", self.road_users, 14))
 
     def notes(self, episodes: Episode) -> dict[str, int]:
         """Agents and road users that metrics or bodies leave out."""
@@ -120,6 +122,16 @@ class Driving(Scene):
             "road users without a body": int(np.sum(road.dropped)),
             "routes beyond those that fit": int(np.sum(road.routes.dropped)),
         }
+
+    def luck(self, episode: Episode) -> Float[Array, "numbers"]:
+        """Signals of the routes at every third step (red, green), then who is where, as the agent sees it at its start, at three times."""
+        road, start = episode.context, episode.start.qpos[:3]
+        lights = road.routes.signals[::3]
+        times = np.array([0, self.steps // 2, self.steps])
+        away = episode.surroundings.pose[times, :, :2] - start[:2]
+        place = rotate(away.reshape(-1, 2), jnp.broadcast_to(-start[2], away.shape[0] * away.shape[1])).reshape(away.shape)
+        place = jnp.where(road.present[times][..., None], place / FAR, 0.0)
+        return jnp.concatenate([jnp.ravel(lights == RED), jnp.ravel(lights == GREEN), jnp.ravel(place), jnp.ravel(road.present[times])])
 
     def flipped(self, episode: Episode) -> Episode:
         """Red lights are green, green and amber ones are red."""
@@ -189,7 +201,7 @@ class Driving(Scene):
         own = rotate(state.qvel[:2], -pose[2])
         routes = see_routes(road.routes, road.routes.signals[time], pose)
         around = jax.tree.map(lambda x: x[time], episode.surroundings)
-        users = see_users(around, road.velocity[time], road.yaw_rate[time], road.present[time], road.kind, pose)
+        users = see_users(around, road.velocity[time], road.yaw_rate[time], road.present[time], road.kind, pose, state.qvel[:2])
         return jnp.concatenate([own, state.qvel[2:3], state.qpos[3:4], routes.reshape(-1), users.reshape(-1)])
 
     def reward(self, episode: Episode, time: Array, state: PhysicsState) -> Float[Array, ""]:
@@ -353,15 +365,22 @@ def see_users(
     present: Bool[Array, "users"],
     kind: Int[Array, "users"],
     pose: Float[Array, "3"],
-) -> Float[Array, "users 11"]:
-    """Each road user from a pose: 1 (there), x, y, cosine and sine of its heading, velocity, length, width, whether it walks, yaw rate."""
+    own_velocity: Float[Array, "2"],
+) -> Float[Array, "users 14"]:
+    """Each road user from a pose.
+
+    Per user: 1 (there), x, y, cosine and sine of its heading, velocity, length, width, whether it walks, yaw rate, then what a driver
+    sees at a glance: m between both bodies, and, if both went straight on, in how many s they would be closest and how far apart then.
+    """
     turned = jnp.broadcast_to(-pose[2], len(present))
     place = rotate(around.pose[:, :2] - pose[:2], turned)
     heading = around.pose[:, 2] - pose[2]
     there = present & (lax.stop_gradient(jnp.max(jnp.abs(place), axis=1)) < FAR)
+    gap = jnp.minimum(capsule_gap(pose, jnp.array(CAR), around.pose, around.size), NEAR)
+    soon, closest = closest_approach(place, rotate(velocity - own_velocity, turned), SOON)
     told = jnp.concatenate([
         place, jnp.cos(heading)[:, None], jnp.sin(heading)[:, None], rotate(velocity, turned), around.size,
-        1.0 * (kind == PEDESTRIAN)[:, None], yaw_rate[:, None],
+        1.0 * (kind == PEDESTRIAN)[:, None], yaw_rate[:, None], jnp.stack([gap, soon, jnp.minimum(closest, NEAR)], axis=1),
     ], axis=1)  # fmt: skip
     return jnp.concatenate([there[:, None].astype(told.dtype), jnp.where(there[:, None], told, 0.0)], axis=1)
 

@@ -1,0 +1,136 @@
+"""Methods and seeds on a scene, and variations of RTC, as evidence: `python -m rtc_mjx.study --scene double_goal --results results`.
+
+    entries (methods, variations) -> a run each (new, resumed or finished) -> evaluation -> table, curves, comparisons, claims
+
+All seeds of an entry are one program. What is finished is not done again, so a study that was stopped at any moment goes on where it
+was, and ends with the numbers of one that was never stopped.
+"""
+
+import argparse
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markdown import Markdown
+
+from rtc_mjx import cache, claims, cli, config, evaluate, report, train
+from rtc_mjx.errors import UsageError
+from rtc_mjx.files import write_whole
+from rtc_mjx.methods import METHODS, method_name
+from rtc_mjx.runs import Run
+from rtc_mjx.scenes import scene_type
+
+VARIED = "rtc_c"  # the method whose parts are varied
+VARIATIONS: Mapping[str, tuple[Any, ...]] = {  # option -> values beside the committed one
+    "encoder-share": (0.125, 0.25, 0.5, 0.75),
+    "losses.adversarial": (0.3, 1.0, 10.0),
+    "losses.type-kl": (0.00003, 0.003, 0.03),
+    "model.type-size": (1, 2, 4, 16),
+    "losses.kl-direction": ("prior_posterior",),
+    "optimiser.gradient": ("dynamics_only", "none"),
+}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One training of the study.
+
+    Attributes:
+        name: of its run and its results.
+        method: which method.
+        options: what differs from the committed settings, as on the command line.
+    """
+
+    name: str
+    method: str
+    options: tuple[str, ...] = ()
+
+
+def entries(scene: str, methods: Sequence[str], ablate: bool, options: Sequence[str]) -> list[Entry]:
+    """What a study trains: the methods, then, if wanted, the variations of RTC's parts."""
+    held = [Entry(name, name, tuple(options)) for name in methods]
+    if ablate:
+        committed = config.flat(config.to_dict(config.defaults(scene, VARIED)))
+        for option, values in VARIATIONS.items():
+            others = [v for v in values if v != committed[option.replace("-", "_")]]
+            held += [Entry(f"{VARIED},{option}={v}", VARIED, (*options, f"--{option}", str(v))) for v in others]
+    return held
+
+
+def on_scene(scene: str) -> list[str]:
+    """The methods that can run on a scene."""
+    return [name for name, method in METHODS.items() if method.kind != "label" or scene_type(scene)().labels]
+
+
+def complete(entry: Entry, scene: str, folder: Path) -> Run:
+    """The entry's run, trained to its last update and evaluated there; only what is missing is done."""
+    if folder.is_dir() and not (folder / "config.json").is_file():
+        if any(not part.name.startswith(".") for part in folder.iterdir()):
+            raise UsageError(f"{folder} is in the way: it is not a run directory")
+        shutil.rmtree(folder)  # stopped before it was begun
+    again = ["--resume"] if folder.is_dir() else []
+    argv = ["--scene", scene, "--method", entry.method, "--run", str(folder), *entry.options, *again]
+    settings = config.from_command_line(argv, "python -m rtc_mjx.study")
+    run = Run.open(folder) if again else None
+    if run is None or settings.updates not in run.checkpoints():
+        run = train.train(settings)
+    if not _evaluated(run):
+        evaluate.main(["--run", str(folder)])
+    return run
+
+
+def _evaluated(run: Run) -> bool:
+    """Whether the evaluation is that of the last update."""
+    if not (run.folder / "evaluation.json").is_file():
+        return False
+    return bool(report.evaluation(run)["update"] == run.config.updates)
+
+
+def write(scene: str, runs: Mapping[str, Run], out: Path) -> str:
+    """Writes results, tables and figures; returns the tables."""
+    methods = {name: run for name, run in runs.items() if name == run.config.method}
+    varied = {name: run for name, run in runs.items() if name not in methods}
+    out.mkdir(parents=True, exist_ok=True)
+    parts = {}
+    if methods:
+        report.curves(list(methods.values()), out / "curves.png")
+        parts = {"table": report.table(methods), "comparisons": claims.comparisons(methods), "claims": claims.claims(scene, methods)}
+    if varied:
+        parts["ablations"] = report.table({name: run for name, run in runs.items() if name == VARIED or name in varied})
+    for name, part in parts.items():
+        if part:
+            write_whole(out / f"{name}.md", part)
+    for name, run in runs.items():
+        write_whole(out / f"{name}.json", json.dumps(report.record(run), indent=1) + "\n")
+    return "\n".join(part for part in parts.values() if part)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Runs or goes on with a study."""
+    parser = cli.Parser(prog="python -m rtc_mjx.study", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", required=True, metavar="NAME", help="the scene")
+    parser.add_argument("--methods", metavar="A,B", help="methods, separated by commas (default: all that run on the scene)")
+    parser.add_argument("--seeds", type=int, default=20, metavar="N", help="seeds of each entry, trained in one program (default: 20)")
+    parser.add_argument("--ablations", action="store_true", help=f"also vary the parts of {VARIED}: {', '.join(VARIATIONS)}")
+    parser.add_argument("--results", type=Path, required=True, metavar="DIR", help="tables and figures go to DIR/<scene>; made if absent")
+    parser.add_argument("--runs", type=Path, metavar="DIR", help="where the runs are kept (default: runs/study)")
+    options, rest = parser.parse_known_args(argv)
+    scene_type(options.scene)
+    chosen = [method_name(name) for name in options.methods.split(",")] if options.methods else on_scene(options.scene)
+    cache.keep_compiled()
+    folder, out = (options.runs or Path("runs/study")) / options.scene, options.results / options.scene
+    wanted = entries(options.scene, chosen, options.ablations, ["--seeds", str(options.seeds), *rest])
+    runs: dict[str, Run] = {}
+    for number, entry in enumerate(wanted, 1):
+        Console(stderr=True).print(f"[{number}/{len(wanted)}] {entry.name}", markup=False)
+        runs[entry.name] = complete(entry, options.scene, folder / entry.name)
+        text = write(options.scene, runs, out)  # after each: a study that is stopped leaves what it has
+    Console().print(Markdown(text))
+
+
+if __name__ == "__main__":
+    cli.run(main)

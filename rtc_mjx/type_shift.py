@@ -1,0 +1,280 @@
+"""What types carry, and what that costs: `python -m rtc_mjx.type_shift --run DIR` (method notes, section 7).
+
+    test episodes, each also driven by other experts -> rollouts under the prior's types and inferred ones: an episode's own, another
+    expert's in the same episode, another episode's -> conditional shift is what the last costs beyond the one before
+    types, xi and the experts' minds -> probes of I(g; xi) and I(g; mind), each beside its permutation null
+    rollouts -> encoded again: do they show the type they were played under?
+    many experts and many rollouts of one episode -> conditional realism: p(tau|xi) compared feature by feature, beside its noise floor
+
+Everything is in bits, rates or the scene's own units, per seed of the run.
+"""
+
+import argparse
+import functools
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax, random
+from jaxtyping import Array
+from rich.console import Console
+from rich.table import Table
+
+from rtc_mjx import cache, cli, dataset, evaluate, metrics
+from rtc_mjx.agent_types import SOURCES
+from rtc_mjx.config import Config
+from rtc_mjx.errors import UsageError
+from rtc_mjx.files import write_whole
+from rtc_mjx.keys import stream
+from rtc_mjx.learner import Learner, start_shapes
+from rtc_mjx.models import Networks
+from rtc_mjx.probe import information
+from rtc_mjx.runs import Run
+from rtc_mjx.scenes import Scene
+from rtc_mjx.trajectory import Demonstration, Trajectory
+
+REALISM_BINS, REALISM_EPISODES = 10, 64
+LEAST_EPISODES = 16  # a probe learns from half of them and is measured on a quarter
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A trained run with what its analysis needs.
+
+    Attributes:
+        config: of the run.
+        learner: the same, ready to act.
+        networks: of all seeds.
+        update: at which they stand.
+        test: test demonstrations, without the truth.
+        truth: the experts' minds.
+    """
+
+    config: Config
+    learner: Learner
+    networks: Networks
+    update: int
+    test: Demonstration
+    truth: Any
+
+
+def set_up(run: Run, episodes: int) -> Setup:
+    """Loads the run's last whole checkpoint, and test episodes."""
+    config = run.config
+    learner = config.learner(dataset.statistics(config.scene, dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN)))
+    update, state, _ = run.restore(start_shapes(learner, config.all_seeds))
+    test = dataset.demonstrations(config.scene, episodes, dataset.TEST)
+    return Setup(config, learner, state.networks, update, dataset.without_truth(test), test.truth)
+
+
+def analyse(run: Run, episodes: int, experts: int) -> dict[str, Any]:
+    """All of type_shift.json.
+
+    Args:
+        run: trained.
+        episodes: test episodes.
+        experts: of each episode, and rollouts, that conditional realism compares.
+    """
+    setup = set_up(run, episodes)
+    out: dict[str, Any] = {
+        "scene": setup.config.scene.name,
+        "method": setup.config.method,
+        "seeds": setup.config.seeds,
+        "episodes": episodes,
+        "update": setup.update,
+        "realism": realism(setup, min(episodes, REALISM_EPISODES), experts),
+    }
+    if not setup.learner.method.encodes:
+        return out
+    types, information_bits = shift(setup), told_by_types(setup)
+    return out | {"types": types, "information": information_bits, "reencoding": reencoding(setup)}
+
+
+def shift(setup: Setup) -> dict[str, dict[str, list[float]]]:
+    """The scene's metrics per source of types, a list over seeds: 'prior', 'paired', 'same_xi', 'shuffled'."""
+    scene, test = setup.config.scene, setup.test
+    others = dataset.by_others(scene, len(jax.tree.leaves(test)[0]), dataset.TEST, 1)
+    given = evaluate.donors(setup.learner.method, test) | {"same_xi": jax.tree.map(lambda x: x[:, 0], others.trajectory)}
+    features = jax.device_get(evaluate.roller(setup.learner, scene.samples)(setup.networks, test, given, stream("type shift", 0)))
+    return evaluate.score(setup.config, features, evaluate.expert_features(setup.config, test))
+
+
+def inferred(setup: Setup) -> np.ndarray:
+    """A type drawn from the encoder for each test demonstration: (seeds, episodes, size)."""
+
+    def one(networks: Networks, held: Demonstration, key: Array) -> Array:
+        return SOURCES["encoder"](setup.learner.agent(networks), held, key).agent_type
+
+    keys = random.split(stream("type shift", 1), len(jax.tree.leaves(setup.test)[0]))
+    draw = jax.jit(lambda networks, test: lax.map(lambda n: jax.vmap(functools.partial(one, n))(test, keys), networks))
+    return np.asarray(draw(setup.networks, setup.test))
+
+
+def told_by_types(setup: Setup) -> dict[str, dict[str, Any]]:
+    """Bits that types tell of xi, which they should not, and of the expert's mind, which they should; with the null of each."""
+    luck = np.asarray(jax.jit(jax.vmap(setup.config.scene.luck))(setup.test.episode))
+    mind = np.stack([np.asarray(x, float) for x in jax.tree.leaves(setup.truth)], axis=1)
+    types = inferred(setup)
+    out = {}
+    for name, of in (("xi", luck), ("mind", mind)):
+        found = [information(g, of) for g in types]
+        null = np.concatenate([values for _, values in found])
+        out[name] = {"bits": [bits for bits, _ in found], "null_mean": float(np.mean(null)), "null_95": float(np.percentile(null, 95))}
+    return out
+
+
+def reencoding(setup: Setup) -> dict[str, list[float]]:
+    """Bits by which a trajectory tells its type from the prior's others, per seed.
+
+    E log2 e(g|tau) / p(g) of the demonstration that g was inferred from, of the rollout under g in its episode, and of one under g in
+    another episode. What a type means is kept where the last two come near the first.
+    """
+
+    def one(networks: Networks, mine: Demonstration, elsewhere: Demonstration, key: Array) -> dict[str, Array]:
+        agent = setup.learner.agent(networks)
+        draw, noise = random.split(key)
+        g = SOURCES["encoder"](agent, mine, draw).agent_type
+        prior = agent.prior(mine.trajectory.observations[0]).log_prob(g)
+
+        def told(track: Trajectory) -> Array:
+            return (agent.posterior(track).log_prob(g) - prior) / jnp.log(2.0)
+
+        tracks = {"rollout": mine.episode, "rollout_elsewhere": elsewhere.episode}
+        return {"demonstration": told(mine.trajectory)} | {
+            name: told(setup.learner.play(agent, episode, g, noise)) for name, episode in tracks.items()
+        }
+
+    test = setup.test
+    other = jax.tree.map(lambda x: jnp.roll(x, 1, axis=0), test)
+    keys = random.split(stream("type shift", 2), len(jax.tree.leaves(test)[0]))
+    run = jax.jit(
+        lambda networks: lax.map(
+            lambda n: lax.map(lambda held: one(n, *held), (test, other, keys), batch_size=min(len(keys), evaluate.AT_ONCE)), networks
+        )
+    )
+    # a rollout that leaves what the encoder knows may be told from its type by thousands of bits: the median is not moved by it
+    return {name: [float(x) for x in np.median(values, axis=1)] for name, values in jax.device_get(run(setup.networks)).items()}
+
+
+def realism(setup: Setup, episodes: int, experts: int) -> dict[str, Any]:
+    """Conditional realism: JSD in bits between p(tau|xi) of experts and of the agent, per feature, mean over episodes.
+
+    Returns:
+        By feature: `agent`, a list over seeds, and `floor`, the same between two groups of experts of the same size.
+    """
+    scene, config = setup.config.scene, setup.config
+    held = jax.tree.map(lambda x: x[:episodes], setup.test)
+    others = dataset.without_truth(dataset.by_others(scene, episodes, dataset.TEST, 2 * experts))
+    theirs = jax.device_get(_described(scene, held, others))
+    ours = jax.device_get(evaluate.roller(setup.learner, experts)(setup.networks, held, {}, stream("type shift", 3)))["prior"]
+    out: dict[str, Any] = {"episodes": episodes, "experts": experts, "features": {}}
+    for name in scene.described_by:
+        first, second = theirs[name][:, :experts], theirs[name][:, experts:]
+        limits = (float(theirs[name].min()), float(max(theirs[name].max(), theirs[name].min() + 1e-6)))
+        mean = functools.partial(_mean_jsd, limits=limits)
+        out["features"][name] = {"agent": [mean(ours[name][i].T, first) for i in range(config.seeds)], "floor": mean(second, first)}
+    return out
+
+
+def _described(scene: Scene, held: Demonstration, others: Demonstration) -> dict[str, Array]:
+    """Features of other experts' trajectories in the episodes of demonstrations: (episodes, experts)."""
+
+    def one(mine: Demonstration, tracks: Trajectory) -> dict[str, Array]:
+        return jax.vmap(lambda track: scene.features(mine, track))(tracks)
+
+    return jax.jit(lambda mine, tracks: lax.map(lambda held: one(*held), (mine, tracks)))(held, others.trajectory)
+
+
+def _mean_jsd(ours: np.ndarray, theirs: np.ndarray, limits: tuple[float, float]) -> float:
+    """Mean over episodes (rows) of the divergence between two samples of each."""
+    return float(np.mean([metrics.jsd(a, b, bins=REALISM_BINS, limits=limits) for a, b in zip(ours, theirs, strict=True)]))
+
+
+def tables(result: dict[str, Any]) -> list[Table]:
+    """The result for the terminal."""
+    out = []
+    if "types" in result:
+        first = Table("types", *next(iter(result["types"].values())), title="rollouts by source of types")
+        for source, values in result["types"].items():
+            first.add_row(source, *(_spread(x) for x in values.values()))
+        second = Table("types tell of", "bits", "null, mean", "null, 95 %", title="mutual information, held out")
+        for name, of in result["information"].items():
+            second.add_row(name, _spread(of["bits"]), f"{of['null_mean']:.3f}", f"{of['null_95']:.3f}")
+        third = Table("trajectory", "bits", title="how well a trajectory shows its type (median)")
+        for name, bits in result["reencoding"].items():
+            third.add_row(name.replace("_", " "), _spread(bits))
+        out += [first, second, third]
+    last = Table("feature", "agent", "floor", title="conditional realism: JSD of p(tau|xi) from the experts', bits")
+    for name, values in result["realism"]["features"].items():
+        last.add_row(name, _spread(values["agent"]), f"{values['floor']:.4f}")
+    return [*out, last]
+
+
+def _spread(values: Sequence[float]) -> str:
+    return f"{np.mean(values):.4g} ± {np.std(values, ddof=1):.2g}" if len(values) > 1 else f"{values[0]:.4g}"
+
+
+def figure(result: dict[str, Any], metric: str, file: Path) -> None:
+    """Three panels: the main metric by source of types, what types tell, conditional realism beside its floor."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    canvas, axes = pyplot.subplots(1, 3, figsize=(11, 3.2))
+    panels = [
+        (result["types"], lambda held: held[metric], metric.replace("_", " ")) if "types" in result else None,
+        (result["information"], lambda held: held["bits"], "types tell of, bits") if "information" in result else None,
+        (result["realism"]["features"], lambda held: held["agent"], "conditional realism: JSD, bits"),
+    ]
+    for axis, panel in zip(axes, panels, strict=True):
+        if panel is None:
+            axis.axis("off")
+            continue
+        held, pick, title = panel
+        for place, values in enumerate(held.values()):
+            seeds = np.asarray(pick(values))
+            axis.bar(place, np.mean(seeds), color="0.75", width=0.6)
+            axis.plot(np.full(len(seeds), place), seeds, "k.", markersize=4)
+            for key, style in (("null_95", "--"), ("floor", "--")):
+                if key in values:
+                    axis.plot([place - 0.3, place + 0.3], [values[key]] * 2, "k" + style, linewidth=1)
+        axis.set_xticks(range(len(held)), [name.replace("_", "\n") for name in held], fontsize=8)
+        axis.set_title(title, fontsize=10)
+        axis.grid(alpha=0.25, axis="y")
+    canvas.suptitle(f"{result['method']} on {result['scene']}: dots are seeds, dashed the null (95 %) or the floor", fontsize=9)
+    canvas.tight_layout()
+    canvas.savefig(file, dpi=150)
+    pyplot.close(canvas)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Analyses a run."""
+    parser = cli.Parser(prog="python -m rtc_mjx.type_shift", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run", type=Path, required=True, metavar="DIR", help="the run directory; its last checkpoint is analysed")
+    parser.add_argument("--episodes", type=int, metavar="N", help="test episodes (default: experts.test of the run)")
+    parser.add_argument("--experts", type=int, default=32, metavar="M", help="experts, and rollouts, of an episode in conditional realism")
+    options = parser.parse_args(argv)
+    run = Run.open(options.run)
+    episodes = options.episodes or run.config.experts.test
+    if episodes < LEAST_EPISODES:
+        raise UsageError(f"--episodes {episodes}: at least {LEAST_EPISODES} are needed")
+    if options.experts < 2:
+        raise UsageError(f"--experts {options.experts}: at least 2 are needed")
+    cache.keep_compiled()
+    result = analyse(run, episodes, options.experts)
+    console = Console(width=None if Console().is_terminal else 140)
+    for part in tables(result):
+        console.print(part)
+    write_whole(run.folder / "type_shift.json", json.dumps(result, indent=1) + "\n")
+    (run.folder / "media").mkdir(exist_ok=True)
+    figure(result, run.config.scene.main_metrics[0], run.folder / "media" / "type_shift.png")
+
+
+if __name__ == "__main__":
+    cli.run(main)
