@@ -1,0 +1,144 @@
+"""The realism meta-metric of the Waymo Open Sim Agents Challenge, weights of 2025, and the figures that go with it.
+
+    logged agents + rollouts + road edges -> features -> likelihoods of the log -> weighted mean
+
+The log itself does not reach 1: the histogram that makes it likeliest is its own, which spreads over as many bins as the log does. Print
+what log replay scores beside any other figure.
+"""
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from rtc_mjx.sim_agents.features import features
+from rtc_mjx.sim_agents.inputs import LoggedAgents, RoadEdges, StopLines
+from rtc_mjx.sim_agents.kinematics import differenced
+from rtc_mjx.sim_agents.likelihood import Histogram, indicator, likelihood
+
+KINEMATIC = {
+    "linear_speed": Histogram(0.05, 0.0, 25.0, 10),  # m/s
+    "linear_acceleration": Histogram(0.05, -12.0, 12.0, 11),  # m/s^2
+    "angular_speed": Histogram(0.05, -0.628, 0.628, 11),  # rad/s
+    "angular_acceleration": Histogram(0.05, -3.14, 3.14, 11),  # rad/s^2
+}
+INTERACTIVE = {
+    "distance_to_nearest_object": Histogram(0.10, -5.0, 40.0, 10),  # m
+    "collision": indicator(0.25),
+    "time_to_collision": Histogram(0.10, 0.0, 5.0, 10),  # s
+}
+MAP_BASED = {
+    "distance_to_road_edge": Histogram(0.05, -20.0, 40.0, 10),  # m
+    "offroad": indicator(0.25),
+    "traffic_light_violation": indicator(0.05),
+}
+ESTIMATES = KINEMATIC | INTERACTIVE | MAP_BASED
+INDICATORS = ("collision", "offroad", "traffic_light_violation")
+
+
+def realism(
+    log: LoggedAgents,
+    rollouts: Float[Array, "rollouts agents future 4"],
+    scored: Int[Array, "scored"],
+    edges: RoadEdges,
+    lines: StopLines | None = None,
+) -> dict[str, Float[Array, ""]]:
+    """All figures of one scene. Rates are over (rollout, agent), displacements in m, the rest in [0, 1].
+
+    `<feature>_likelihood` of each feature, its weighted means `kinematic`, `interactive`, `map_based` and `realism_meta_metric`;
+    `average_displacement_error` and `min_average_displacement_error` (over all valid times, the history and its zeros included; the
+    smallest over rollouts of the mean over agents); `simulated_collision_rate`, `simulated_offroad_rate`,
+    `simulated_traffic_light_violation_rate`.
+
+    A likelihood is NaN where nothing can be scored (no vehicle, no road edges, no stop lines); means are over the features that can.
+
+    Args:
+        log: agents over history and future.
+        rollouts: their simulated poses at the future times.
+        scored: indices of the agents whose features are scored, in the challenge the self-driving car and those to predict; the others
+            are there to be met. Who is not valid at the current time is not scored; -1 stands for nobody.
+        edges: of the road.
+        lines: stop lines; without them red lights are not scored.
+    """
+    future = rollouts.shape[2]
+    there = log.valid[:, -future - 1, None]
+    logged = log.valid & there
+    simulated = jnp.concatenate([logged[:, :-future], jnp.repeat(there, future, axis=1)], axis=1)
+
+    def of(pose: Array, valid: Array) -> dict[str, Array]:
+        return features(pose, valid, log.size, scored, edges, lines, future=future)
+
+    ours = of(log.pose, logged)
+    theirs = lax.map(lambda pose: of(jnp.concatenate([log.pose[:, :-future], pose], axis=1), simulated), rollouts)
+    chosen = logged[scored] & (scored >= 0)[:, None]
+    counts = _counts(chosen[:, -future:], log.vehicle[scored], edges, lines)
+    likelihoods = _likelihoods(ours, theirs, counts, _known(simulated[scored], future))
+    return {
+        **{f"{name}_likelihood": value for name, value in likelihoods.items()},
+        "realism_meta_metric": _weighted(likelihoods, ESTIMATES),
+        "kinematic": _weighted(likelihoods, KINEMATIC),
+        "interactive": _weighted(likelihoods, INTERACTIVE),
+        "map_based": _weighted(likelihoods, MAP_BASED),
+        **_displacements(log.pose[scored], rollouts[:, scored], chosen),
+        **{f"simulated_{name}_rate": _rate(theirs[name], chosen[:, -future:]) for name in INDICATORS},
+    }
+
+
+def _counts(
+    valid: Bool[Array, "scored future"], vehicle: Bool[Array, "scored"], edges: RoadEdges, lines: StopLines | None
+) -> dict[str, Array]:
+    """Which logged values count for each feature. Differences across the current time do not, as in the challenge."""
+    speed = differenced(valid)
+    kinematic = dict(zip(KINEMATIC, (speed, differenced(speed), speed, differenced(speed)), strict=True))
+    rest = dict.fromkeys(INTERACTIVE | MAP_BASED, valid)
+    vehicles, road, signals = valid & vehicle[:, None], valid & jnp.any(edges.valid), valid & (lines is not None)
+    return (
+        kinematic
+        | rest
+        | {
+            "time_to_collision": vehicles,
+            "distance_to_road_edge": road,
+            "offroad": road,
+            "traffic_light_violation": signals & vehicle[:, None],
+        }
+    )
+
+
+def _known(simulated: Bool[Array, "scored times"], future: int) -> dict[str, Array]:
+    """Which simulated values enter the histograms: all but differences whose neighbours are not there."""
+    speed = differenced(simulated)
+    kinematic = dict(zip(KINEMATIC, (speed, differenced(speed), speed, differenced(speed)), strict=True))
+    return {name: known[:, -future:] for name, known in (dict.fromkeys(ESTIMATES, simulated) | kinematic).items()}
+
+
+def _likelihoods(ours: dict[str, Array], theirs: dict[str, Array], counts: dict[str, Array], known: dict[str, Array]) -> dict[str, Array]:
+    """The likelihood of each feature of the log; indicators are first gathered over time."""
+    out = {}
+    for name, estimate in ESTIMATES.items():
+        log, rollouts, held, seen = ours[name], theirs[name], counts[name], known[name]
+        if name in INDICATORS:
+            log, rollouts = (jnp.any(x & held, axis=-1, keepdims=True) for x in (log, rollouts))
+            held, seen = jnp.any(held, axis=-1, keepdims=True), seen[:, -1:]
+        out[name] = likelihood(estimate, 1.0 * log, 1.0 * rollouts, jnp.broadcast_to(seen, rollouts.shape), held)
+    return out
+
+
+def _weighted(likelihoods: dict[str, Array], estimates: dict[str, Histogram]) -> Float[Array, ""]:
+    """The mean by the features' weights, over those that could be scored."""
+    values = jnp.stack([likelihoods[name] for name in estimates])
+    weights = jnp.where(jnp.isnan(values), 0.0, jnp.array([estimate.weight for estimate in estimates.values()]))
+    return jnp.sum(jnp.where(weights > 0, weights * values, 0.0)) / jnp.sum(weights)
+
+
+def _displacements(log: Float[Array, "scored times 4"], rollouts: Array, counts: Bool[Array, "scored times"]) -> dict[str, Array]:
+    """Mean and smallest displacement of rollouts from the log in space, m."""
+    off = jnp.sqrt(jnp.sum((rollouts - log[:, -rollouts.shape[2] :])[..., :3] ** 2, axis=-1))
+    times = jnp.sum(counts, axis=1)
+    ade = jnp.sum(jnp.where(counts[:, -rollouts.shape[2] :], off, 0.0), axis=-1) / jnp.maximum(times, 1)
+    mean = jnp.sum(ade, axis=1) / jnp.sum(times > 0)
+    return {"average_displacement_error": jnp.mean(mean), "min_average_displacement_error": jnp.min(mean)}
+
+
+def _rate(happens: Bool[Array, "rollouts scored future"], counts: Bool[Array, "scored future"]) -> Float[Array, ""]:
+    """Share of (rollout, agent) it happens to at any time at which the log has the agent."""
+    agents = jnp.any(counts, axis=1)
+    return jnp.sum(jnp.any(happens & counts, axis=-1) & agents) / (happens.shape[0] * jnp.sum(agents))
