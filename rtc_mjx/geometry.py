@@ -5,10 +5,11 @@ A path is an array of points at a constant spacing along its arc length, so that
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 Point = Float[Array, "2"]
 Pose = Float[Array, "3"]
+Coordinates = tuple[Array, ...]  # x, y and perhaps z, each of any shape
 
 
 def rotate(vector: Float[Array, "*batch 2"], angle: Float[Array, "*batch"]) -> Float[Array, "*batch 2"]:
@@ -170,10 +171,48 @@ def off_road(
     In space, heights times `stretch` count for which edge is the nearest, not for the distance to it: the road above is another road.
     At a vertex two segments are equally near; the one that the point faces more squarely decides the side.
     """
-    a, b = edges[:, 0, :2], edges[:, 1, :2]
-    share = _share(point[:2], a, b)
-    away = point - edges[:, 0] - share[:, None] * (edges[:, 1] - edges[:, 0])
-    beside = -cross(b - a, point[:2] - a) / length(b - a)  # positive to the right
-    near = jnp.sum(away[:, :2] ** 2, axis=-1) + stretch**2 * jnp.sum(away[:, 2:] ** 2, axis=-1)
-    nearest = jnp.argmin(lax.stop_gradient(jnp.where(valid, near - 1e-3 * beside**2, jnp.inf)))
-    return jnp.where(jnp.any(valid), jnp.sign(beside[nearest]) * length(away[nearest, :2]), -jnp.inf)
+    nearest = nearest_edge(point, edges, valid, stretch=stretch)
+    return jnp.where(jnp.any(valid), past_edge(point, edges[nearest]), -jnp.inf)
+
+
+def nearest_edge(
+    point: Float[Array, "space"], edges: Float[Array, "edges 2 space"], valid: Bool[Array, "edges"], *, stretch: float = 1.0
+) -> Int[Array, ""]:
+    """Which segment is the nearest to a point, as `off_road` has it."""
+    place, ends = tuple(lax.stop_gradient(point)), lax.stop_gradient(edges)
+    return jnp.argmin(jnp.where(valid, _remoteness(place, tuple(ends[:, 0].T), tuple(ends[:, 1].T), stretch), jnp.inf))
+
+
+def nearest_edges(
+    points: Float[Array, "points space"], edges: Float[Array, "edges 2 space"], valid: Bool[Array, "edges"], *, stretch: float = 1.0
+) -> Int[Array, "points"]:
+    """The same of many points, which are compared with one segment after the other: in whole vectors, and in little memory."""
+    place, ends = tuple(lax.stop_gradient(points).T), lax.stop_gradient(edges)
+
+    def closer(best: tuple[Array, Array], edge: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array], None]:
+        index, (a, b), there = edge
+        rank = jnp.where(there, _remoteness(place, tuple(a), tuple(b), stretch), jnp.inf)
+        return (jnp.minimum(rank, best[0]), jnp.where(rank < best[0], index, best[1])), None
+
+    none = jnp.full(len(points), jnp.inf, points.dtype), jnp.zeros(len(points), int)
+    (_, nearest), _ = lax.scan(closer, none, (jnp.arange(len(edges)), ends, valid))
+    return nearest
+
+
+def past_edge(point: Float[Array, "space"], edge: Float[Array, "2 space"]) -> Float[Array, ""]:
+    """Signed distance in m past one segment of a road edge, in the plane; positive to its right."""
+    a, b = edge[0, :2], edge[1, :2]
+    return -jnp.sign(cross(b - a, point[:2] - a)) * point_to_segment(point[:2], a, b)
+
+
+def _remoteness(point: Coordinates, a: Coordinates, b: Coordinates, stretch: float) -> Array:
+    """What the nearest edge is judged by: the squared distance in m^2, a little less for an edge that is faced squarely.
+
+    Written out by coordinate: forty times as fast for many points as with the coordinates in an axis.
+    """
+    way, off = [q - p for p, q in zip(a, b, strict=True)], [x - p for p, x in zip(a, point, strict=True)]
+    long = jnp.maximum(way[0] ** 2 + way[1] ** 2, 1e-12)
+    share = jnp.clip((off[0] * way[0] + off[1] * way[1]) / long, 0, 1)
+    x, y, *z = (o - share * w for o, w in zip(off, way, strict=True))
+    square = (way[0] * off[1] - way[1] * off[0]) ** 2 / long
+    return x**2 + y**2 + sum((stretch * height) ** 2 for height in z) - 1e-3 * square

@@ -40,40 +40,38 @@ def features(
     """
     pose = jnp.where(valid[..., None], pose, 0.0)
     motion = {name: values[:, -future:] for name, values in kinematics(pose[scored]).items()}
-    around = _around(pose, valid, size, scored, edges, future)
-    red = jnp.zeros((len(scored), future), bool) if lines is None else _reds(pose[scored], lines, future) & valid[scored, -future:]
+    around = _around(pose, valid, size[:, :2], scored, future)
+    edge = distance_to_road_edge(pose[scored, -future:], size[scored], edges)
+    present = valid[scored, -future:]
+    red = (
+        jnp.zeros((len(scored), future), bool)
+        if lines is None
+        else runs_red(pose[scored, -future - 1 :, :2], lines, lines.red[-future - 1 :])[:, 1:]
+    )
     return {
         **motion,
         **around,
-        "collision": around["distance_to_nearest_object"] < 0,
-        "offroad": around["distance_to_road_edge"] > 0,
-        "traffic_light_violation": red,
+        "distance_to_road_edge": edge,
+        "collision": (around["distance_to_nearest_object"] < 0) & present,
+        "offroad": (edge > 0) & present,
+        "traffic_light_violation": red & present,
     }
 
 
-def _around(pose: Array, valid: Array, size: Array, scored: Array, edges: RoadEdges, future: int) -> dict[str, Array]:
-    """How agents stand to the others and to the road. One time is looked at after the other: memory does not grow with their number."""
+def _around(pose: Array, valid: Array, size: Array, scored: Array, future: int) -> dict[str, Array]:
+    """How agents stand to the others. One time is looked at after the other: memory does not grow with their number."""
 
     def at(moment: tuple[Array, Array, Array, Array]) -> dict[str, Array]:
-        pose, speed, valid, moving = moment
-        plane, box = pose[:, jnp.array([0, 1, 3])], size[:, :2]
+        plane, speed, valid, moving = moment
 
         def one(agent: Array) -> dict[str, Array]:
             return {
-                "distance_to_nearest_object": nearest_gap(agent, plane, box, valid),
-                "time_to_collision": time_to_collision(agent, plane, box, speed, valid, moving),
-                "distance_to_road_edge": distance_to_road_edge(pose[agent], size[agent], edges),
+                "distance_to_nearest_object": nearest_gap(agent, plane, size, valid),
+                "time_to_collision": time_to_collision(agent, plane, size, speed, valid, moving),
             }
 
         return jax.vmap(one)(scored)
 
-    moments = (pose, plane_speed(pose), valid, differenced(valid))
+    moments = (pose[..., jnp.array([0, 1, 3])], plane_speed(pose), valid, differenced(valid))
     found = lax.map(at, jax.tree.map(lambda x: x[:, -future:].swapaxes(0, 1), moments))
     return {name: values.T for name, values in found.items()}
-
-
-def _reds(pose: Array, lines: StopLines, future: int) -> Bool[Array, "scored future"]:
-    """Who runs a red at each future time."""
-    place = pose[..., :2].swapaxes(0, 1)
-    steps = (place[-future - 1 : -1], place[-future:], lines.red[-future:])
-    return lax.map(lambda step: runs_red(step[0], step[1], lines, step[2]), steps).T

@@ -41,6 +41,7 @@ def realism(
     scored: Int[Array, "scored"],
     edges: RoadEdges,
     lines: StopLines | None = None,
+    present: Bool[Array, "agents future"] | None = None,
 ) -> dict[str, Float[Array, ""]]:
     """All figures of one scene. Rates are over (rollout, agent), displacements in m, the rest in [0, 1].
 
@@ -58,11 +59,13 @@ def realism(
             are there to be met. Who is not valid at the current time is not scored; -1 stands for nobody.
         edges: of the road.
         lines: stop lines; without them red lights are not scored.
+        present: when the rollouts have each agent; in the challenge, and where not given, always. A replay has who the log has: the log itself
+            scores `realism(log, log.pose[None, :, -future:], scored, edges, lines, log.valid[:, -future:])`.
     """
     future = rollouts.shape[2]
     there = log.valid[:, -future - 1, None]
-    logged = log.valid & there
-    simulated = jnp.concatenate([logged[:, :-future], jnp.repeat(there, future, axis=1)], axis=1)
+    logged, held = log.valid & there, jnp.repeat(there, future, axis=1)
+    simulated = jnp.concatenate([logged[:, :-future], held if present is None else held & present], axis=1)
 
     def of(pose: Array, valid: Array) -> dict[str, Array]:
         return features(pose, valid, log.size, scored, edges, lines, future=future)
@@ -78,7 +81,7 @@ def realism(
         "kinematic": _weighted(likelihoods, KINEMATIC),
         "interactive": _weighted(likelihoods, INTERACTIVE),
         "map_based": _weighted(likelihoods, MAP_BASED),
-        **_displacements(log.pose[scored], rollouts[:, scored], chosen),
+        **_displacements(log.pose[scored], rollouts[:, scored], chosen & simulated[scored]),
         **{f"simulated_{name}_rate": _rate(theirs[name], chosen[:, -future:]) for name in INDICATORS},
     }
 
@@ -104,7 +107,7 @@ def _counts(
 
 
 def _known(simulated: Bool[Array, "scored times"], future: int) -> dict[str, Array]:
-    """Which simulated values enter the histograms: all but differences whose neighbours are not there."""
+    """Which simulated values enter the histograms: those of who is there, and of differences those whose neighbours are."""
     speed = differenced(simulated)
     kinematic = dict(zip(KINEMATIC, (speed, differenced(speed), speed, differenced(speed)), strict=True))
     return {name: known[:, -future:] for name, known in (dict.fromkeys(ESTIMATES, simulated) | kinematic).items()}
@@ -117,7 +120,7 @@ def _likelihoods(ours: dict[str, Array], theirs: dict[str, Array], counts: dict[
         log, rollouts, held, seen = ours[name], theirs[name], counts[name], known[name]
         if name in INDICATORS:
             log, rollouts = (jnp.any(x & held, axis=-1, keepdims=True) for x in (log, rollouts))
-            held, seen = jnp.any(held, axis=-1, keepdims=True), seen[:, -1:]
+            held, seen = jnp.any(held, axis=-1, keepdims=True), jnp.ones_like(seen[:, -1:])
         out[name] = likelihood(estimate, 1.0 * log, 1.0 * rollouts, jnp.broadcast_to(seen, rollouts.shape), held)
     return out
 
@@ -131,9 +134,12 @@ def _weighted(likelihoods: dict[str, Array], estimates: dict[str, Histogram]) ->
 
 def _displacements(log: Float[Array, "scored times 4"], rollouts: Array, counts: Bool[Array, "scored times"]) -> dict[str, Array]:
     """Mean and smallest displacement of rollouts from the log in space, m."""
-    off = jnp.sqrt(jnp.sum((rollouts - log[:, -rollouts.shape[2] :])[..., :3] ** 2, axis=-1))
+    future = rollouts.shape[2]
+    apart = jnp.where(counts[:, -future:, None], (rollouts - log[:, -future:])[..., :3], 0.0)
+    square = jnp.sum(apart**2, axis=-1)
+    off = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)  # zero, with a finite derivative, where they are at one
     times = jnp.sum(counts, axis=1)
-    ade = jnp.sum(jnp.where(counts[:, -rollouts.shape[2] :], off, 0.0), axis=-1) / jnp.maximum(times, 1)
+    ade = jnp.sum(off, axis=-1) / jnp.maximum(times, 1)
     mean = jnp.sum(ade, axis=1) / jnp.sum(times > 0)
     return {"average_displacement_error": jnp.mean(mean), "min_average_displacement_error": jnp.min(mean)}
 
