@@ -59,8 +59,8 @@ def realism(
             are there to be met. Who is not valid at the current time is not scored; -1 stands for nobody.
         edges: of the road.
         lines: stop lines; without them red lights are not scored.
-        present: when the rollouts have each agent; in the challenge, and where not given, always. A replay has who the log has: the log itself
-            scores `realism(log, log.pose[None, :, -future:], scored, edges, lines, log.valid[:, -future:])`.
+        present: when the rollouts have each agent; in the challenge, and where not given, always. A replay has who the log has: the log
+            itself scores `realism(log, log.pose[None, :, -future:], scored, edges, lines, log.valid[:, -future:])`.
     """
     future = rollouts.shape[2]
     there = log.valid[:, -future - 1, None]
