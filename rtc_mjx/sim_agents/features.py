@@ -54,7 +54,7 @@ def features(
         "distance_to_road_edge": edge,
         "collision": (around["distance_to_nearest_object"] < 0) & present,
         "offroad": (edge > 0) & present,
-        "traffic_light_violation": red & present,
+        "traffic_light_violation": red & present & valid[scored, -future - 1 : -1],
     }
 
 
