@@ -19,7 +19,7 @@ from rtc_mjx.sim_agents.roads import distance_to_road_edge, runs_red
 TIME = np.arange(30) / 10
 HISTORY, FUTURE = 4, 12
 CAR = jnp.array([4.0, 2.0, 1.5])
-realism = jax.jit(sim_agents.realism)
+compiled = jax.jit(sim_agents.realism)
 
 
 def poses(x, y=0.0, z=0.0, heading=0.0):
@@ -258,8 +258,7 @@ def test_an_indicator_is_a_bernoulli_variable():
 
 def test_a_likelihood_is_the_geometric_mean_over_what_counts():
     estimate = Histogram(1.0, 0.0, 2.0, 2, smoothing=0.0)
-    log, simulated = jnp.array([[0.5, 0.5, 1.5], [1.5, 1.5, 0.5]]), jnp.tile(jnp.array([0.5, 0.5, 1.5, 1.5]), (2, 1))[:, None]
-    simulated = simulated.at[1].set(1.5)[None, :, 0].swapaxes(0, 0)
+    log, simulated = jnp.array([[0.5, 0.5, 1.5], [1.5, 1.5, 0.5]]), jnp.array([[[0.5, 0.5, 1.5, 1.5], [1.5] * 4]])
     counts = jnp.array([[True, True, False], [True, False, False]])
     found = likelihood(estimate, log, simulated, jnp.ones(simulated.shape, bool), counts)
     assert float(found) == pytest.approx((0.5 * 0.5 * 1.0) ** (1 / 3))
@@ -268,6 +267,13 @@ def test_a_likelihood_is_the_geometric_mean_over_what_counts():
 
 def test_weights_of_the_meta_metric_sum_to_one():
     assert sum(estimate.weight for estimate in ESTIMATES.values()) == pytest.approx(1.0)
+
+
+def realism(log, rollouts, scored, edges, lines, present=None):
+    """Its figures; all scenes here have one shape, filled up with nobody, so that it is compiled once."""
+    scored = jnp.concatenate([jnp.asarray(scored), jnp.full(3 - len(scored), -1)])
+    present = jnp.ones((log.valid.shape[0], FUTURE), bool) if present is None else present
+    return jax.device_get(compiled(log, rollouts, scored, edges, lines, present))
 
 
 # Whole scenes --------------------------------------------------------------------------------------------------------
@@ -331,10 +337,10 @@ def test_the_meta_metric_is_the_weighted_mean_and_so_are_its_parts():
 
 
 def test_displacements_are_over_all_logged_times_and_the_smallest_is_of_a_whole_scene():
-    """Two rollouts, 3 m off and 1 m off; the history counts with zeros: 12 of 16 times, 9 of 13 for the agent that is missing thrice."""
-    log, _, _, edges, _ = scene()
-    off = jnp.array([[3.0, 0, 0, 0], [1.0, 0, 0, 0]])[:, None, None]
-    found = realism(log, log.pose[None, :, HISTORY:] + off, jnp.array([0, 4]), edges)
+    """Half of the rollouts are 3 m off, half 1 m; the history counts with zeros: 12 of 16 times, 9 of 13 for the agent that is missing thrice."""
+    log, _, _, edges, lines = scene()
+    off = jnp.array([3.0, 1.0, 3.0, 1.0, 3.0, 1.0])[:, None, None, None] * jnp.array([1.0, 0, 0, 0])
+    found = realism(log, log.pose[None, :, HISTORY:] + off, jnp.array([0, 4]), edges, lines)
     share = (12 / 16 + 9 / 13) / 2
     assert float(found["average_displacement_error"]) == pytest.approx(2 * share, rel=1e-5)
     assert float(found["min_average_displacement_error"]) == pytest.approx(share, rel=1e-5)
@@ -379,15 +385,15 @@ def test_what_is_logged_of_who_is_not_there_means_nothing():
 def test_who_is_not_there_at_the_current_time_is_neither_scored_nor_met():
     log, rollouts, _, edges, lines = scene()  # the fourth comes after the current time; put it onto the first
     onto = dataclasses.replace(log, pose=log.pose.at[3].set(log.pose[0])), rollouts.at[:, 3].set(rollouts[:, 0])
-    expected = realism(log, rollouts, jnp.array([0]), edges, lines)
-    for scored in ([0], [0, 3], [0, -1]):
-        for name, value in realism(*onto, jnp.array(scored), edges, lines).items():
+    expected = realism(log, rollouts, [0], edges, lines)
+    for scored in ([0], [0, 3]):
+        for name, value in realism(*onto, scored, edges, lines).items():
             assert float(value) == pytest.approx(float(expected[name]), rel=1e-5), (scored, name)
 
 
 def test_what_cannot_be_scored_is_left_out_of_the_mean():
     log, rollouts, _, edges, _ = scene()
-    found = realism(log, rollouts, jnp.array([4]), dataclasses.replace(edges, valid=jnp.zeros(3, bool)))  # a pedestrian without a road
+    found = realism(log, rollouts, [4], dataclasses.replace(edges, valid=jnp.zeros(3, bool)), None)  # a pedestrian without a road
     left = [name for name in ESTIMATES if not np.isnan(found[f"{name}_likelihood"])]
     assert set(ESTIMATES) - set(left) == {"time_to_collision", "distance_to_road_edge", "offroad", "traffic_light_violation"}
     weights = [ESTIMATES[name].weight for name in left]
@@ -396,11 +402,11 @@ def test_what_cannot_be_scored_is_left_out_of_the_mean():
 
 
 def test_rates_are_over_rollouts_and_agents():
-    log, _, _, edges, _ = scene()
-    rollouts = jnp.repeat(log.pose[None, :, HISTORY:], 4, axis=0)
-    rollouts = rollouts.at[1, 0, 5, 1].set(-30.0)  # in one rollout of four, one of two agents is off the road for one time
-    found = realism(log, rollouts, jnp.array([0, 2]), edges)
-    assert float(found["simulated_offroad_rate"]) == pytest.approx(1 / 8)
+    log, _, _, edges, lines = scene()
+    rollouts = jnp.repeat(log.pose[None, :, HISTORY:], 6, axis=0)
+    rollouts = rollouts.at[1, 0, 5, 1].set(-30.0)  # in one rollout of six, one of two agents is off the road for one time
+    found = realism(log, rollouts, jnp.array([0, 2]), edges, lines)
+    assert float(found["simulated_offroad_rate"]) == pytest.approx(1 / 12)
     assert float(found["simulated_collision_rate"]) == 0
 
 
