@@ -337,7 +337,7 @@ def test_the_meta_metric_is_the_weighted_mean_and_so_are_its_parts():
 
 
 def test_displacements_are_over_all_logged_times_and_the_smallest_is_of_a_whole_scene():
-    """Half of the rollouts are 3 m off, half 1 m; the history counts with zeros: 12 of 16 times, 9 of 13 for the agent that is missing thrice."""
+    """Half of the rollouts are 3 m off, half 1 m; the history counts with zeros: 12 of 16 times, 9 of 13 for who is missing thrice."""
     log, _, _, edges, lines = scene()
     off = jnp.array([3.0, 1.0, 3.0, 1.0, 3.0, 1.0])[:, None, None, None] * jnp.array([1.0, 0, 0, 0])
     found = realism(log, log.pose[None, :, HISTORY:] + off, jnp.array([0, 4]), edges, lines)
