@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rtc_mjx import geometry, sim_agents
+from rtc_mjx.errors import UsageError
 from rtc_mjx.logs import GREEN, RED, LoggedScene, RoadGraph
 from rtc_mjx.sim_agents import ESTIMATES, LoggedAgents, RoadEdges, StopLines, stop_lines
 from rtc_mjx.sim_agents.interactions import nearest_gap, time_to_collision
@@ -408,6 +409,17 @@ def test_rates_are_over_rollouts_and_agents():
     found = realism(log, rollouts, jnp.array([0, 2]), edges, lines)
     assert float(found["simulated_offroad_rate"]) == pytest.approx(1 / 12)
     assert float(found["simulated_collision_rate"]) == 0
+
+
+def test_arrays_that_do_not_belong_together_are_refused():
+    log, rollouts, scored, edges, lines = scene()
+    for wrong in (
+        (log, rollouts[:, :4], scored, edges, lines),
+        (log, jnp.tile(rollouts, (1, 1, 2, 1)), scored, edges, lines),
+        (log, rollouts, scored, edges, dataclasses.replace(lines, red=lines.red[1:])),
+    ):
+        with pytest.raises(UsageError, match="need"):
+            sim_agents.realism(*wrong)
 
 
 def test_features_have_finite_derivatives():

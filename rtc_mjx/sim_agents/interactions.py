@@ -2,7 +2,6 @@
 
 import math
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -62,18 +61,3 @@ def _ahead(pose: Float[Array, "3"], size: Float[Array, "2"], others: Array, size
     place = rotate(others[:, :2] - pose[:2], jnp.broadcast_to(-pose[2], turned.shape))
     reach = 0.5 * size + shadow(sizes, turned)
     return place[:, 0] - reach[:, 0], reach[:, 1] - jnp.abs(place[:, 1])
-
-
-def interactions(
-    scored: Int[Array, "scored"],
-    pose: Float[Array, "agents 3"],
-    size: Float[Array, "agents 2"],
-    speed: Float[Array, "agents"],
-    valid: Bool[Array, "agents"],
-    moving: Bool[Array, "agents"],
-) -> dict[str, Float[Array, "scored"]]:
-    """Both features, of the agents that are scored."""
-    return {
-        "distance_to_nearest_object": jax.vmap(lambda agent: nearest_gap(agent, pose, size, valid))(scored),
-        "time_to_collision": jax.vmap(lambda agent: time_to_collision(agent, pose, size, speed, valid, moving))(scored),
-    }

@@ -6,9 +6,6 @@ from jaxtyping import Array, Bool, Float
 from rtc_mjx.geometry import length, wrapped
 from rtc_mjx.logs import RATE
 
-SPEEDS = ("linear_speed", "angular_speed")
-ACCELERATIONS = ("linear_acceleration", "angular_acceleration")
-
 
 def kinematics(pose: Float[Array, "agents times 4"]) -> dict[str, Float[Array, "agents times"]]:
     """Linear (m/s, m/s^2, in space) and angular (rad/s, rad/s^2) speed and acceleration of x, y, z, heading.

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from rtc_mjx.errors import UsageError
 from rtc_mjx.sim_agents.features import features
 from rtc_mjx.sim_agents.inputs import LoggedAgents, RoadEdges, StopLines
 from rtc_mjx.sim_agents.kinematics import differenced
@@ -61,7 +62,11 @@ def realism(
         lines: stop lines; without them red lights are not scored.
         present: when the rollouts have each agent; in the challenge, and where not given, always. A replay has who the log has: the log
             itself scores `realism(log, log.pose[None, :, -future:], scored, edges, lines, log.valid[:, -future:])`.
+
+    Raises:
+        UsageError: shapes that do not belong together.
     """
+    _check(log, rollouts, lines)
     future = rollouts.shape[2]
     there = log.valid[:, -future - 1, None]
     logged, held = log.valid & there, jnp.repeat(there, future, axis=1)
@@ -74,7 +79,8 @@ def realism(
     theirs = lax.map(lambda pose: of(jnp.concatenate([log.pose[:, :-future], pose], axis=1), simulated), rollouts)
     chosen = logged[scored] & (scored >= 0)[:, None]
     counts = _counts(chosen[:, -future:], log.vehicle[scored], edges, lines)
-    likelihoods = _likelihoods(ours, theirs, counts, _known(simulated[scored], future))
+    known = {name: where[:, -future:] for name, where in _by_differences(simulated[scored]).items()}
+    likelihoods = _likelihoods(ours, theirs, counts, known)
     return {
         **{f"{name}_likelihood": value for name, value in likelihoods.items()},
         "realism_meta_metric": _weighted(likelihoods, ESTIMATES),
@@ -86,31 +92,38 @@ def realism(
     }
 
 
-def _counts(
-    valid: Bool[Array, "scored future"], vehicle: Bool[Array, "scored"], edges: RoadEdges, lines: StopLines | None
-) -> dict[str, Array]:
+def _check(log: LoggedAgents, rollouts: Array, lines: StopLines | None) -> None:
+    """Refuses arrays that do not belong together; shapes are known before anything is compiled.
+
+    Raises:
+        UsageError: one line with both shapes.
+    """
+    agents, times = log.valid.shape
+    if rollouts.shape[1] != agents or rollouts.shape[2] >= times:
+        raise UsageError(
+            f"rollouts of shape {rollouts.shape} need all {agents} logged agents and fewer future times than {times} logged ones"
+        )
+    if lines is not None and lines.red.shape[0] != times:
+        raise UsageError(f"signals at {lines.red.shape[0]} times need those of the log, {times}")
+
+
+def _counts(valid: Array, vehicle: Bool[Array, "scored"], edges: RoadEdges, lines: StopLines | None) -> dict[str, Array]:
     """Which logged values count for each feature. Differences across the current time do not, as in the challenge."""
+    vehicles, road = valid & vehicle[:, None], valid & jnp.any(edges.valid)
+    return _by_differences(valid) | {
+        "time_to_collision": vehicles,
+        "distance_to_road_edge": road,
+        "offroad": road,
+        "traffic_light_violation": vehicles & (lines is not None),
+    }
+
+
+def _by_differences(valid: Bool[Array, "scored times"]) -> dict[str, Array]:
+    """Where each feature has a value: where the agent is there, or for differences its neighbours in time are."""
     speed = differenced(valid)
-    kinematic = dict(zip(KINEMATIC, (speed, differenced(speed), speed, differenced(speed)), strict=True))
-    rest = dict.fromkeys(INTERACTIVE | MAP_BASED, valid)
-    vehicles, road, signals = valid & vehicle[:, None], valid & jnp.any(edges.valid), valid & (lines is not None)
-    return (
-        kinematic
-        | rest
-        | {
-            "time_to_collision": vehicles,
-            "distance_to_road_edge": road,
-            "offroad": road,
-            "traffic_light_violation": signals & vehicle[:, None],
-        }
-    )
-
-
-def _known(simulated: Bool[Array, "scored times"], future: int) -> dict[str, Array]:
-    """Which simulated values enter the histograms: those of who is there, and of differences those whose neighbours are."""
-    speed = differenced(simulated)
-    kinematic = dict(zip(KINEMATIC, (speed, differenced(speed), speed, differenced(speed)), strict=True))
-    return {name: known[:, -future:] for name, known in (dict.fromkeys(ESTIMATES, simulated) | kinematic).items()}
+    acceleration = differenced(speed)
+    kinematic = dict(zip(KINEMATIC, (speed, acceleration, speed, acceleration), strict=True))
+    return dict.fromkeys(ESTIMATES, valid) | kinematic
 
 
 def _likelihoods(ours: dict[str, Array], theirs: dict[str, Array], counts: dict[str, Array], known: dict[str, Array]) -> dict[str, Array]:
