@@ -5,10 +5,11 @@ A path is an array of points at a constant spacing along its arc length, so that
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 Point = Float[Array, "2"]
 Pose = Float[Array, "3"]
+Coordinates = tuple[Array, ...]  # x, y and perhaps z, each of any shape
 
 
 def rotate(vector: Float[Array, "*batch 2"], angle: Float[Array, "*batch"]) -> Float[Array, "*batch 2"]:
@@ -92,9 +93,13 @@ def corners(pose: Float[Array, "*batch 3"], size: Float[Array, "*batch 2"]) -> F
 
 def point_to_segment(point: Float[Array, "*batch 2"], a: Float[Array, "*batch 2"], b: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
     """Distance in m of a point from a segment."""
+    return length(point - a - _share(point, a, b)[..., None] * (b - a))
+
+
+def _share(point: Float[Array, "*batch 2"], a: Float[Array, "*batch 2"], b: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
+    """Where the nearest point of the segment ab is: 0 at a, 1 at b."""
     way = b - a
-    share = jnp.clip(jnp.sum((point - a) * way, axis=-1) / jnp.maximum(jnp.sum(way**2, axis=-1), 1e-12), 0, 1)
-    return length(point - a - share[..., None] * way)
+    return jnp.clip(jnp.sum((point - a) * way, axis=-1) / jnp.maximum(jnp.sum(way**2, axis=-1), 1e-12), 0, 1)
 
 
 def segment_distance(
@@ -122,19 +127,40 @@ def capsule_gap(pose: Pose, size: Point, others: Float[Array, "n 3"], sizes: Flo
 
 def boxes_overlap(pose: Pose, size: Point, others: Float[Array, "n 3"], sizes: Float[Array, "n 2"]) -> Bool[Array, "n"]:
     """Whether oriented boxes overlap: none of the four directions of their sides separates them."""
-    turned = others[:, 2] - pose[2]
+    here, mine = jnp.broadcast_to(pose, others.shape), jnp.broadcast_to(size, sizes.shape)
+    return jnp.max(_separations(here, mine, others, sizes), axis=-1) < 0
+
+
+def box_gap(pose: Pose, size: Point, others: Float[Array, "n 3"], sizes: Float[Array, "n 2"]) -> Float[Array, "n"]:
+    """Signed distance in m of oriented boxes (length, width): how far they are apart, or minus how far one must move to come free.
+
+    Apart, one of the two nearest points is a corner; overlapping, the shortest way out is at right angles to a side.
+    """
+    here, mine = jnp.broadcast_to(pose, others.shape), jnp.broadcast_to(size, sizes.shape)
+    corner = [_to_box(corners(others, sizes), here, mine), _to_box(corners(here, mine), others, sizes)]
+    side = jnp.max(_separations(here, mine, others, sizes), axis=-1)
+    return jnp.where(side < 0, side, jnp.min(jnp.concatenate(corner, axis=-1), axis=-1))
+
+
+def _to_box(points: Float[Array, "n points 2"], pose: Float[Array, "n 3"], size: Float[Array, "n 2"]) -> Float[Array, "n points"]:
+    """Distance in m of points from a box; zero inside."""
+    seen = rotate(points - pose[:, None, :2], jnp.broadcast_to(-pose[:, None, 2], points.shape[:-1]))
+    return length(jnp.maximum(jnp.abs(seen) - 0.5 * size[:, None], 0))
+
+
+def _separations(pose: Array, size: Array, others: Array, sizes: Array) -> Float[Array, "n 4"]:
+    """The room in m between the shadows of two boxes along each direction of their sides; negative where they overlap."""
+    turned, away = others[:, 2] - pose[:, 2], others[:, :2] - pose[:, :2]
+    mine = jnp.abs(rotate(away, -pose[:, 2])) - 0.5 * size - shadow(sizes, turned)
+    theirs = jnp.abs(rotate(away, -others[:, 2])) - 0.5 * sizes - shadow(size, turned)
+    return jnp.concatenate([mine, theirs], axis=-1)
+
+
+def shadow(size: Float[Array, "*batch 2"], turned: Float[Array, "*batch"]) -> Float[Array, "*batch 2"]:
+    """How far a box reaches from its centre, m, along and across a direction it is turned from by an angle."""
     cos, sin = jnp.abs(jnp.cos(turned)), jnp.abs(jnp.sin(turned))
-    away = others[:, :2] - pose[:2]
-
-    def apart(heading: Array, mine: Array, theirs: Array) -> Array:
-        """Whether a direction of a box with that heading separates: `mine` (length, width) is its own, `theirs` the other's."""
-        ahead, aside = jnp.moveaxis(jnp.abs(rotate(away, jnp.broadcast_to(-heading, turned.shape))), -1, 0)
-        length, width = mine[..., 0], mine[..., 1]
-        along = 0.5 * (length + theirs[..., 0] * cos + theirs[..., 1] * sin)
-        across = 0.5 * (width + theirs[..., 0] * sin + theirs[..., 1] * cos)
-        return (ahead >= along) | (aside >= across)
-
-    return ~(apart(pose[2], size, sizes) | apart(others[:, 2], sizes, size))
+    along, across = size[..., 0] * cos + size[..., 1] * sin, size[..., 0] * sin + size[..., 1] * cos
+    return 0.5 * jnp.stack([along, across], axis=-1)
 
 
 def closest_approach(
@@ -145,14 +171,56 @@ def closest_approach(
     return soon, length(place + soon[..., None] * velocity)
 
 
-def off_road(point: Point, edges: Float[Array, "edges 2 2"], valid: Bool[Array, "edges"]) -> Float[Array, ""]:
+def off_road(
+    point: Float[Array, "space"], edges: Float[Array, "edges 2 space"], valid: Bool[Array, "edges"], *, stretch: float = 1.0
+) -> Float[Array, ""]:
     """Signed distance in m past the nearest road edge: positive off the road, negative on it. The road lies to an edge's left.
 
+    In space, heights times `stretch` count for which edge is the nearest, not for the distance to it: the road above is another road.
     At a vertex two segments are equally near; the one that the point faces more squarely decides the side.
     """
-    a, b = edges[:, 0], edges[:, 1]
-    distance = point_to_segment(jnp.broadcast_to(point, a.shape), a, b)
-    beside = -cross(b - a, point - a) / length(b - a)  # positive to the right
-    rank = jnp.where(valid, distance**2 - 1e-3 * beside**2, jnp.inf)
-    nearest = jnp.argmin(rank)
-    return jnp.where(jnp.any(valid), jnp.sign(beside[nearest]) * distance[nearest], -jnp.inf)
+    nearest = nearest_edge(point, edges, valid, stretch=stretch)
+    return jnp.where(jnp.any(valid), past_edge(point, edges[nearest]), -jnp.inf)
+
+
+def nearest_edge(
+    point: Float[Array, "space"], edges: Float[Array, "edges 2 space"], valid: Bool[Array, "edges"], *, stretch: float = 1.0
+) -> Int[Array, ""]:
+    """Which segment is the nearest to a point, as `off_road` has it."""
+    place, ends = tuple(lax.stop_gradient(point)), lax.stop_gradient(edges)
+    return jnp.argmin(jnp.where(valid, _remoteness(place, tuple(ends[:, 0].T), tuple(ends[:, 1].T), stretch), jnp.inf))
+
+
+def nearest_edges(
+    points: Float[Array, "points space"], edges: Float[Array, "edges 2 space"], valid: Bool[Array, "edges"], *, stretch: float = 1.0
+) -> Int[Array, "points"]:
+    """The same of many points, which are compared with one segment after the other: in whole vectors, and in little memory."""
+    place, ends = tuple(lax.stop_gradient(points).T), lax.stop_gradient(edges)
+
+    def closer(best: tuple[Array, Array], edge: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array], None]:
+        index, (a, b), there = edge
+        rank = jnp.where(there, _remoteness(place, tuple(a), tuple(b), stretch), jnp.inf)
+        return (jnp.minimum(rank, best[0]), jnp.where(rank < best[0], index, best[1])), None
+
+    none = jnp.full(len(points), jnp.inf, points.dtype), jnp.zeros(len(points), int)
+    (_, nearest), _ = lax.scan(closer, none, (jnp.arange(len(edges)), ends, valid))
+    return nearest
+
+
+def past_edge(point: Float[Array, "space"], edge: Float[Array, "2 space"]) -> Float[Array, ""]:
+    """Signed distance in m past one segment of a road edge, in the plane; positive to its right."""
+    a, b = edge[0, :2], edge[1, :2]
+    return -jnp.sign(cross(b - a, point[:2] - a)) * point_to_segment(point[:2], a, b)
+
+
+def _remoteness(point: Coordinates, a: Coordinates, b: Coordinates, stretch: float) -> Array:
+    """What the nearest edge is judged by: the squared distance in m^2, a little less for an edge that is faced squarely.
+
+    Written out by coordinate: forty times as fast for many points as with the coordinates in an axis.
+    """
+    way, off = [q - p for p, q in zip(a, b, strict=True)], [x - p for p, x in zip(a, point, strict=True)]
+    long = jnp.maximum(way[0] ** 2 + way[1] ** 2, 1e-12)
+    share = jnp.clip((off[0] * way[0] + off[1] * way[1]) / long, 0, 1)
+    x, y, *z = (o - share * w for o, w in zip(off, way, strict=True))
+    square = (way[0] * off[1] - way[1] * off[0]) ** 2 / long
+    return x**2 + y**2 + sum((stretch * height) ** 2 for height in z) - 1e-3 * square
