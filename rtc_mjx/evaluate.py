@@ -8,14 +8,16 @@ expert, and expert against expert at the same size, stand beside them: the ceili
 import argparse
 import functools
 import json
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax, random
+import rich.progress
+from jax import random
 from jaxtyping import Array
 from rich.console import Console
 from rich.table import Table
@@ -30,6 +32,7 @@ from rtc_mjx.learner import Learner, start_shapes
 from rtc_mjx.methods import Method
 from rtc_mjx.models import Networks
 from rtc_mjx.runs import Run
+from rtc_mjx.scenes import Scene
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
 AT_ONCE = 2048  # rollouts simulated at once
@@ -38,7 +41,8 @@ Features = dict[str, np.ndarray]
 
 
 Donors = dict[str, Trajectory]  # the trajectory that each episode's type is inferred from, by source of types
-Roll = Callable[[Networks, Demonstration, Donors, Array], dict[str, dict[str, Array]]]
+Roll = Callable[[Networks, Demonstration, Donors, Array], dict[str, Features]]
+Watch = Callable[[Sequence[Any]], Iterable[Any]]
 
 
 def donors(method: Method, test: Demonstration) -> Donors:
@@ -48,12 +52,13 @@ def donors(method: Method, test: Demonstration) -> Donors:
     return {"paired": test.trajectory, "shuffled": jax.tree.map(lambda x: jnp.roll(x, 1, axis=0), test.trajectory)}
 
 
-def roller(learner: Learner, samples: int) -> Roll:
-    """A compiled function (networks, test demonstrations, donors, key) -> features per type source, (seeds, samples, episodes).
+def roller(learner: Learner, samples: int, watch: Watch = iter) -> Roll:
+    """A function (networks, test demonstrations, donors, key) -> features per type source, as numpy arrays (seeds, samples, episodes).
 
     Args:
         learner: who is tested; the networks are those of all seeds.
         samples: rollouts of each episode, every one with a type of its own.
+        watch: goes through the parts of the work, such as a progress bar.
     """
 
     def one(networks: Networks, mine: Demonstration, given: Donors, key: Array) -> dict[str, dict[str, Array]]:
@@ -64,23 +69,40 @@ def roller(learner: Learner, samples: int) -> Roll:
         tracks = {name: learner.play(agent, mine.episode, typed.agent_type, noise) for name, typed in types.items()}
         return {name: learner.scene.features(mine, track) | {FINITE: _finite(track)} for name, track in tracks.items()}
 
-    def all_episodes(networks: Networks, test: Demonstration, given: Donors, key: Array) -> dict[str, dict[str, Array]]:
-        count = jax.tree.leaves(test)[0].shape[0]
-        several = jax.vmap(functools.partial(one, networks), in_axes=(None, None, 0))
-        inputs = (test, given, random.split(key, (count, samples)))
-        features = lax.map(lambda held: several(*held), inputs, batch_size=min(count, max(1, AT_ONCE // samples)))
-        return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), features)
+    @jax.jit
+    def several(networks: Networks, test: Demonstration, given: Donors, keys: Array) -> dict[str, dict[str, Array]]:
+        of_episode = jax.vmap(functools.partial(one, networks), in_axes=(None, None, 0))
+        return jax.vmap(of_episode, out_axes=1)(test, given, keys)
 
-    return jax.jit(lambda networks, test, given, key: lax.map(lambda held: all_episodes(held, test, given, key), networks))
+    def roll(networks: Networks, test: Demonstration, given: Donors, key: Array) -> dict[str, Features]:
+        count, seeds = (jax.tree.leaves(x)[0].shape[0] for x in (test, networks))
+        keys = jax.vmap(lambda episode: random.split(random.fold_in(key, episode), samples))(jnp.arange(count))
+        at_once = part_size(count, samples)
+        parts = []
+        for seed, first in watch([(seed, first) for seed in range(seeds) for first in range(0, count, at_once)]):
+            rows = np.arange(first, first + at_once) % count  # one shape, one program; what is there twice is cut off
+            mine = jax.tree.map(lambda x, rows=rows: x[rows], (test, given, keys))
+            found = jax.device_get(several(jax.tree.map(lambda x, i=seed: x[i], networks), *mine))
+            parts.append(jax.tree.map(lambda x, left=count - first: x[:, :left], found))
+        each = len(parts) // seeds
+        of_seeds = [jax.tree.map(lambda *x: np.concatenate(x, axis=1), *parts[i : i + each]) for i in range(0, len(parts), each)]
+        return jax.tree.map(lambda *x: np.stack(x), *of_seeds)
+
+    return roll
+
+
+def part_size(count: int, samples: int) -> int:
+    """How many of so many episodes are simulated at once."""
+    return min(count, max(1, AT_ONCE // samples))
 
 
 def _finite(track: Trajectory) -> Array:
     return jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(track)]))
 
 
-def expert_features(config: Config, test: Demonstration) -> Features:
+def expert_features(scene: Scene, test: Demonstration) -> Features:
     """Features of the test demonstrations."""
-    return jax.device_get(jax.jit(jax.vmap(lambda held: config.scene.features(held, held.trajectory)))(dataset.without_truth(test)))
+    return jax.device_get(jax.jit(jax.vmap(lambda held: scene.features(held, held.trajectory)))(dataset.without_truth(test)))
 
 
 def score(config: Config, features: dict[str, Features], expert: Features) -> dict[str, dict[str, list[float]]]:
@@ -98,17 +120,17 @@ def score(config: Config, features: dict[str, Features], expert: Features) -> di
     return out
 
 
-def evaluate(run: Run, episodes: int) -> dict[str, Any]:
-    """All of evaluation.json for a run's last whole checkpoint."""
+def evaluate(run: Run, episodes: int, watch: Watch = iter) -> dict[str, Any]:
+    """All of evaluation.json for a run's last whole checkpoint; `watch` goes through the parts of the work."""
     config = run.config
     train = dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN)
     tests = [dataset.demonstrations(config.scene, episodes, seed) for seed in (dataset.TEST, dataset.SECOND_TEST)]
     learner = config.learner(dataset.statistics(config.scene, train))
     update, state, _ = run.restore(start_shapes(learner, config.all_seeds))
-    roll, shown = roller(learner, config.scene.samples), dataset.without_truth(tests[0])
+    roll, shown = roller(learner, config.scene.samples, watch), dataset.without_truth(tests[0])
     given = donors(learner.method, shown)
-    features = jax.device_get(roll(state.networks, shown, given, stream("evaluation", 0)))
-    expert, second = (expert_features(config, test) for test in tests)
+    features = roll(state.networks, shown, given, stream("evaluation", 0))
+    expert, second = (expert_features(config.scene, test) for test in tests)
     table = score(config, features, expert)
     means = {source: _summaries(config, features[source], expert, table[source]) for source in table}
     return {
@@ -119,7 +141,7 @@ def evaluate(run: Run, episodes: int) -> dict[str, Any]:
         "update": update,
         "metrics": means["prior"],
         "types": means,
-        "reaction": reaction(config, lambda held: roll(state.networks, held, given, stream("evaluation", 0)), shown, features, expert),
+        "reaction": reaction(learner, functools.partial(roll, state.networks), shown, features, expert),
         "ranges": config.scene.ranges(expert),
         "notes": {what: count for what, count in config.scene.notes(tests[0].episode).items() if count},
         "reference": {"expert": config.scene.metrics(expert, expert), "expert_vs_expert": config.scene.metrics(second, expert)},
@@ -127,27 +149,31 @@ def evaluate(run: Run, episodes: int) -> dict[str, Any]:
 
 
 def reaction(
-    config: Config, roll: Callable[[Demonstration], Any], shown: Demonstration, features: dict[str, Features], expert: Features
+    learner: Learner, roll: Callable[..., dict[str, Features]], shown: Demonstration, features: dict[str, Features], expert: Features
 ) -> dict[str, dict[str, float]]:
     """What agents do when luck is turned round at the same type (method notes, section 7), beside the experts with the same minds.
+
+    On as many of the episodes as are simulated at once.
 
     Returns:
         By who acts: `as_it_was` and `flipped`, the share that did what luck bears on, and `like_expert`, the share whose decision
         in the flipped episode is that of its expert. Empty where the scene has nothing to turn.
     """
-    if config.scene.flipped(shown.episode) is None:
+    scene = learner.scene
+    if scene.flipped(shown.episode) is None:
         return {}
-    turned = jax.jit(jax.vmap(config.scene.flipped))(shown.episode)
-    count = len(next(iter(expert.values())))
-    again = dataset.without_truth(dataset.redriven(config.scene, count, dataset.TEST, config.scene.flipped))
-    theirs = expert_features(config, again)["decided"]
-    flipped = jax.device_get(roll(Demonstration(turned, shown.trajectory, ())))
+    count = part_size(len(next(iter(expert.values()))), scene.samples)
+    again = dataset.without_truth(dataset.redriven(scene, count, dataset.TEST, scene.flipped))
+    theirs, before = expert_features(scene, again)["decided"], expert["decided"][:count]
+    track = jax.tree.map(lambda x: x[:count], shown.trajectory)
+    turned = Demonstration(again.episode, track, ())
+    flipped = roll(turned, donors(learner.method, turned), stream("evaluation", 0))
 
     def told(before: np.ndarray, after: np.ndarray) -> dict[str, float]:
         return {"as_it_was": float(np.mean(before)), "flipped": float(np.mean(after)), "like_expert": float(np.mean(after == theirs))}
 
-    ours = {source: told(features[source]["decided"], flipped[source]["decided"]) for source in features}
-    return ours | {"expert": told(expert["decided"], theirs)}
+    ours = {source: told(features[source]["decided"][..., :count], flipped[source]["decided"]) for source in features}
+    return ours | {"expert": told(before, theirs)}
 
 
 def _summaries(config: Config, features: Features, expert: Features, values: dict[str, list[float]]) -> dict[str, dict[str, Any]]:
@@ -192,7 +218,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         raise UsageError(f"--episodes {options.episodes}: at least 4 are needed")
     cache.keep_compiled()
     run = Run.open(options.run)
-    result = evaluate(run, options.episodes or run.config.experts.test)
+    bar = functools.partial(rich.progress.track, description="rollouts", console=Console(stderr=True), disable=not sys.stderr.isatty())
+    result = evaluate(run, options.episodes or run.config.experts.test, bar)
     console = Console(width=None if Console().is_terminal else 140)
     console.print(table(result))
     for who, shares in result["reaction"].items():

@@ -85,13 +85,13 @@ class Tests:
     def __init__(self, config: Config, learner: Learner) -> None:
         self.config, self.roll = config, evaluate.roller(learner, config.scene.samples)
         demonstrations = dataset.demonstrations(config.scene, config.experts.test, dataset.TEST)
-        self.expert = evaluate.expert_features(config, demonstrations)
+        self.expert = evaluate.expert_features(config.scene, demonstrations)
         self.episodes = dataset.without_truth(demonstrations)
         self.donors = evaluate.donors(learner.method, self.episodes)
 
     def __call__(self, state: TrainState) -> dict[str, list[float]]:
         """Metrics by name; those under other types than the prior's are prefixed."""
-        features = jax.device_get(self.roll(state.networks, self.episodes, self.donors, stream("evaluation", 0)))
+        features = self.roll(state.networks, self.episodes, self.donors, stream("evaluation", 0))
         scores = evaluate.score(self.config, features, self.expert)
         named = {source: f"{source}/" if source != "prior" else "" for source in scores}
         return {named[source] + name: values for source, table in scores.items() for name, values in table.items()}

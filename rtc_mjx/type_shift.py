@@ -100,8 +100,8 @@ def shift(setup: Setup) -> dict[str, dict[str, list[float]]]:
     scene, test = setup.config.scene, setup.test
     others = dataset.by_others(scene, len(jax.tree.leaves(test)[0]), dataset.TEST, 1)
     given = evaluate.donors(setup.learner.method, test) | {"same_xi": jax.tree.map(lambda x: x[:, 0], others.trajectory)}
-    features = jax.device_get(evaluate.roller(setup.learner, scene.samples)(setup.networks, test, given, stream("type shift", 0)))
-    return evaluate.score(setup.config, features, evaluate.expert_features(setup.config, test))
+    features = evaluate.roller(setup.learner, scene.samples)(setup.networks, test, given, stream("type shift", 0))
+    return evaluate.score(setup.config, features, evaluate.expert_features(scene, test))
 
 
 def inferred(setup: Setup) -> np.ndarray:
@@ -171,7 +171,7 @@ def realism(setup: Setup, episodes: int, experts: int) -> dict[str, Any]:
     held = jax.tree.map(lambda x: x[:episodes], setup.test)
     others = dataset.without_truth(dataset.by_others(scene, episodes, dataset.TEST, 2 * experts))
     theirs = jax.device_get(_described(scene, held, others))
-    ours = jax.device_get(evaluate.roller(setup.learner, experts)(setup.networks, held, {}, stream("type shift", 3)))["prior"]
+    ours = evaluate.roller(setup.learner, experts)(setup.networks, held, {}, stream("type shift", 3))["prior"]
     out: dict[str, Any] = {"episodes": episodes, "experts": experts, "features": {}}
     for name in scene.described_by:
         first, second = theirs[name][:, :experts], theirs[name][:, experts:]
