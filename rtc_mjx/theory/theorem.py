@@ -1,0 +1,228 @@
+"""Theorem 1 of Igl et al., section III, put to random instances: what it says, what it needs, and where it breaks.
+
+As our notes state it: under conditional type shift the agent's actions say less about the state than the expert's, I(S, A_hat) < I(S, A), and
+therefore they are noisier, H(A_hat|S) > H(A|S). Here A is what the policy does under paired types (a policy that reconstructs plays the
+expert), A_hat what it does under types drawn from the prior, which is the types' marginal. What the tables say:
+
+- I(S, A_hat) < I(S, A) does *not* follow from conditional shift and a deterministic policy alone: `breaking` is an instance of two states and two
+  types, and two in five random ones break it too.
+- It does follow where the type leaves less open than the actions tell: I(S, A_hat) <= I(S, A_hat | G) <= H(A_hat | G), G being
+  independent of S, so that `residual_hat` < I(S, A) suffices. Solution 2 has a residual of zero; a policy that deviates from "the type
+  is the action" with probability at most epsilon has one of at most `fano(epsilon)`.
+- H(A_hat|S) - H(A|S) = (I(S,A) - I(S,A_hat)) + (H(A_hat) - H(A)). The last step needs H(A_hat) >= H(A), or at least not to lose
+  more of it than of the information: `counterexample`. Solution 2 keeps the actions' frequencies, so it meets that. Where each type has
+  actions of its own in every state, H(A|S) = H(G|S) and H(A_hat|S) = H(G): the last step then holds whether the claim does or not.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import random
+from jaxtyping import Array, Float
+
+from rtc_mjx.pytree import pytree
+from rtc_mjx.theory import tables
+
+STATES, TYPE_COUNT, ACTIONS = 3, 2, 4  # of a random instance; actions enough for each type to have its own
+MARGIN = 1e-9  # nats: smaller differences are rounding
+NEARLY = 0.02  # with what probability the nearly state-blind policy looks at the state
+
+
+@pytree
+class Instance:
+    """A policy and the types it was trained under.
+
+    Attributes:
+        state_type: q(s, g).
+        policy: pi(a|s,g).
+    """
+
+    state_type: Float[Array, "*batch states types"]
+    policy: Float[Array, "*batch states types actions"]
+
+
+@pytree
+class Comparison:
+    """Both sides of the theorem, in nats.
+
+    Attributes:
+        information: I(S, A), paired types.
+        information_hat: I(S, A_hat), types from the prior.
+        entropy: H(A).
+        entropy_hat: H(A_hat).
+        shift: I(G; S), conditional type shift.
+        residual_hat: H(A_hat | G), what the type leaves open at test.
+    """
+
+    information: Float[Array, "*batch"]
+    information_hat: Float[Array, "*batch"]
+    entropy: Float[Array, "*batch"]
+    entropy_hat: Float[Array, "*batch"]
+    shift: Float[Array, "*batch"]
+    residual_hat: Float[Array, "*batch"]
+
+    @property
+    def noise(self) -> Array:
+        """H(A | S)."""
+        return self.entropy - self.information
+
+    @property
+    def noise_hat(self) -> Array:
+        """H(A_hat | S)."""
+        return self.entropy_hat - self.information_hat
+
+    @property
+    def shifted(self) -> Array:
+        """The theorem's hypothesis: there is conditional type shift."""
+        return self.shift > MARGIN
+
+    @property
+    def bounded(self) -> Array:
+        """The hypothesis under which we can prove the claim: H(A_hat | G) < I(S, A)."""
+        return self.residual_hat < self.information - MARGIN
+
+    @property
+    def claim(self) -> Array:
+        """I(S, A_hat) < I(S, A)."""
+        return self.information_hat < self.information - MARGIN
+
+    @property
+    def reversed(self) -> Array:
+        """I(S, A_hat) > I(S, A): the claim does not just miss by a tie."""
+        return self.information_hat > self.information + MARGIN
+
+    @property
+    def as_varied(self) -> Array:
+        """The condition that the last step needs: H(A_hat) >= H(A)."""
+        return self.entropy_hat >= self.entropy - MARGIN
+
+    @property
+    def last_step(self) -> Array:
+        """H(A_hat | S) > H(A | S)."""
+        return self.noise_hat > self.noise
+
+
+def compare(instance: Instance) -> Comparison:
+    """Both sides of the theorem for one instance."""
+    types, policy = instance.state_type, instance.policy
+    shuffled = tables.independent(types)
+    paired, prior = (jnp.einsum("sg,sga->sa", joint, policy) for joint in (types, shuffled))
+    return Comparison(
+        information=tables.mutual_information(paired),
+        information_hat=tables.mutual_information(prior),
+        entropy=tables.entropy(jnp.sum(paired, axis=0)),
+        entropy_hat=tables.entropy(jnp.sum(prior, axis=0)),
+        shift=tables.conditional_shift(types),
+        residual_hat=tables.conditional_entropy(jnp.einsum("sg,sga->ga", shuffled, policy)),
+    )
+
+
+def fano(epsilon: Float[Array, ""] | float, actions: int) -> Float[Array, ""]:
+    """h(epsilon) + epsilon log(actions - 1), in nats: bounds the entropy of an action that is, but with probability epsilon, a given one."""
+    chosen = jnp.array([1 - epsilon, epsilon])
+    return tables.entropy(chosen) + epsilon * jnp.log(float(max(1, actions - 1)))
+
+
+def counterexample() -> Instance:
+    """The claim holds, its last step does not (method notes, section 7). Found by search; q(s,g) was rounded and sums to 1.0001."""
+    choice = jnp.array([[1, 2], [2, 2], [0, 2]])
+    types = jnp.array([[0.0811, 0.1526], [0.0131, 0.6218], [0.0413, 0.0902]])
+    return Instance(tables.normalised(types), tables.one_hot(choice, 3))
+
+
+def breaking() -> Instance:
+    """The claim itself does not hold, though the type can be read off the action and the policy is deterministic (ours, made by hand).
+
+    Type 0 heeds the state, but in training it came up in state 0 alone, where that does not show; type 1 does not heed it. Under prior
+    types, type 0 meets state 1 and reacts to it: the actions then say more about the state, not less.
+    """
+    choice = jnp.array([[0, 2], [1, 2]])
+    return Instance(jnp.array([[0.5, 0.4], [0.0, 0.1]]), tables.one_hot(choice, 3))
+
+
+Generator = Callable[[Array], Instance]
+
+
+def shares(key: Array, shape: tuple[int, ...], axis: int | None = -1) -> Array:
+    """Random probabilities along an axis, or over all: squares of normal numbers, which normalised are Dirichlet(1/2)."""
+    squares = random.normal(key, shape) ** 2
+    return squares / jnp.sum(squares, axis=axis, keepdims=True)
+
+
+def _types(key: Array) -> Float[Array, "states types"]:
+    return shares(key, (STATES, TYPE_COUNT), axis=None)
+
+
+def any_policy(key: Array) -> Instance:
+    """Any joint of states and types, any policy."""
+    types, policy = random.split(key)
+    return Instance(_types(types), shares(policy, (STATES, TYPE_COUNT, ACTIONS)))
+
+
+def deterministic(key: Array) -> Instance:
+    """Any deterministic policy: it reconstructs the expert that it defines without error."""
+    types, policy = random.split(key)
+    return Instance(_types(types), tables.one_hot(random.randint(policy, (STATES, TYPE_COUNT), 0, ACTIONS), ACTIONS))
+
+
+def readable(key: Array) -> Instance:
+    """Deterministic, and every type has actions of its own: the encoder needs nothing but the action."""
+    types, policy = random.split(key)
+    each = ACTIONS // TYPE_COUNT
+    choice = random.randint(policy, (STATES, TYPE_COUNT), 0, each) + each * jnp.arange(TYPE_COUNT)
+    return Instance(_types(types), tables.one_hot(choice, ACTIONS))
+
+
+def nearly_blind(key: Array) -> Instance:
+    """As solution 2, but with probability NEARLY any reaction to the state."""
+    types, policy, reaction = random.split(key, 3)
+    blind = tables.one_hot(random.permutation(policy, ACTIONS)[:TYPE_COUNT], ACTIONS)
+    other = shares(reaction, (STATES, TYPE_COUNT, ACTIONS))
+    return Instance(_types(types), (1 - NEARLY) * blind + NEARLY * other)
+
+
+def blind(key: Array) -> Instance:
+    """Solution 2: the action is a function of the type alone."""
+    types, policy = random.split(key)
+    choice = random.permutation(policy, ACTIONS)[:TYPE_COUNT]
+    return Instance(_types(types), jnp.tile(tables.one_hot(choice, ACTIONS), (STATES, 1, 1)))
+
+
+HYPOTHESES: dict[str, Generator] = {
+    "any policy": any_policy,
+    "deterministic": deterministic,
+    "deterministic, type in action": readable,
+    "nearly state-blind": nearly_blind,
+    "state-blind (solution 2)": blind,
+}
+
+
+def compared(hypothesis: str, instances: int, seed: int = 0) -> Comparison:
+    """Comparisons of random instances that meet a hypothesis, along one axis; in double precision, for MARGIN to mean something."""
+    with jax.enable_x64(True):
+        keys = random.split(random.key(seed), instances)
+        return jax.device_get(jax.jit(jax.vmap(lambda key: compare(HYPOTHESES[hypothesis](key))))(keys))
+
+
+def example(make: Callable[[], Instance]) -> Comparison:
+    """The comparison of one given instance, in double precision."""
+    with jax.enable_x64(True):
+        return jax.device_get(compare(make()))
+
+
+def census(found: Comparison) -> dict[str, int]:
+    """How many instances keep and break what; only those with conditional type shift count."""
+    held = found.shifted
+    counts = {
+        "instances": held,
+        "claim": held & found.claim,
+        "reversed": held & found.reversed,
+        "bounded": held & found.bounded,
+        "bounded_without_claim": held & found.bounded & ~found.claim,
+        "last_step_fails": held & found.claim & ~found.last_step,
+        "as_varied": held & found.claim & found.as_varied,
+        "as_varied_and_last_step_fails": held & found.claim & found.as_varied & ~found.last_step,
+    }
+    return {name: int(np.sum(which)) for name, which in counts.items()}
