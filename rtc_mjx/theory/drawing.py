@@ -4,6 +4,7 @@ Each function draws on the figure, or the part of one, that it is given.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -44,7 +45,7 @@ def _heat(axis: Axes, table: np.ndarray) -> None:
 def theorem(canvas: FigureBase, found: Comparison, title: str) -> None:
     """I(S, A_hat) against I(S, A) of random instances; those that break the claim or its last step stand out."""
     axis = canvas.subplots()
-    kinds = {
+    kinds: dict[str, tuple[Any, dict[str, Any]]] = {
         "claim and last step hold": (found.shifted & found.claim & found.last_step, {"marker": ".", "c": "0.75", "s": 8}),
         "last step fails": (found.shifted & found.claim & ~found.last_step, {"marker": "x", "c": "black", "s": 16, "lw": 0.8}),
         "claim reversed": (found.reversed & found.shifted, {"marker": "^", "facecolors": "none", "edgecolors": "0.35", "s": 12, "lw": 0.6}),
@@ -83,8 +84,8 @@ def learned(canvas: FigureBase, expert: Expert, results: dict[str, Learned], eps
 def everything(file: Path, expert: Expert, found: Comparison, results: dict[str, Learned], epsilon: float) -> None:
     """The command's figure."""
     canvas = Figure(figsize=(11, 6.2), layout="constrained")
-    top, bottom = canvas.subfigures(2, 1, height_ratios=(1, 2))
-    left, right = bottom.subfigures(1, 2, width_ratios=(1, 1.7))
+    top, bottom = canvas.subfigures(2, 1, height_ratios=(1, 2), squeeze=False)[:, 0]
+    left, right = bottom.subfigures(1, 2, width_ratios=(1, 1.7), squeeze=False)[0]
     plays(top, expert, epsilon)
     theorem(left, found, "random deterministic policies with conditional shift")
     learned(right, expert, results, epsilon)

@@ -65,8 +65,8 @@ class Logits:
 
     def agent(self, epsilon: Float[Array, ""] | float) -> TypedAgent:
         """The agent they stand for."""
-        parts = (jax.nn.softmax(logits) for logits in (self.encoder, self.policy, self.prior))
-        return TypedAgent(*parts, tables.observation(self.policy.shape[0], epsilon))
+        encoder, policy, prior = (jax.nn.softmax(logits) for logits in (self.encoder, self.policy, self.prior))
+        return TypedAgent(encoder, policy, prior, tables.observation(self.policy.shape[0], epsilon))
 
 
 def start(seed: Int[Array, ""], expert: Expert, types: int = TYPES) -> Logits:
@@ -100,15 +100,13 @@ def objective(logits: Logits, expert: Expert, method: Method, setting: Setting) 
     """L_rec + beta L_kl + lambda L_adv, summed over the method's branches (paper, eq. 3), in nats."""
     agent = logits.agent(setting.epsilon)
     plays = [played(branch, expert, agent) for branch in method.branches]
-    fixed = logit(expert, sum(share(b) * play for b, play in zip(method.branches, plays, strict=True)))
+    fakes = jnp.sum(jnp.stack([share(b) * play for b, play in zip(method.branches, plays, strict=True)]), axis=0)
+    fixed = logit(expert, fakes)
+    shared = {"cloning": solutions.reconstruction(expert, agent), "type_kl": setting.type_kl * solutions.type_kl(expert, agent)}
     total = jnp.zeros(())
     for branch, play in zip(method.branches, plays, strict=True):
-        values = {
-            "cloning": lambda: solutions.reconstruction(expert, agent),
-            "type_kl": lambda: setting.type_kl * solutions.type_kl(expert, agent),
-            "adversarial": lambda play=play: setting.adversarial * jnp.sum(play * jax.nn.softplus(-fixed)),
-        }
-        total += sum(values[name]() for name in branch.losses if name in values)
+        values = shared | {"adversarial": setting.adversarial * jnp.sum(play * jax.nn.softplus(-fixed))}
+        total += sum(values[name] for name in branch.losses if name in values)
     return total
 
 

@@ -5,10 +5,10 @@ From the paper: one step instead of a trajectory; an agent whose behaviour has a
 independently of the light; a second whose type holds the action outright, luck included, which is as good at reconstruction and fails
 then; and a small epsilon that decides between them.
 
-Our reading, since the paper leaves it open: epsilon is the probability with which the policy sees the wrong state. Solution 2 never looks at
-the state, so it does not mind; solution 1 loses h(epsilon) on every action that hangs on the state. Against that, the type costs
-beta I(G; S,A) = beta (I(G;S) + I(G;A|S)), which is beta I(S;A) more for solution 2. So the naive objective is minimal at solution 2, of
-the two, exactly while beta lies below `boundary`; on the crossing that is h(epsilon) in bits.
+Our reading, since our notes on the paper leave it open: epsilon is the probability with which the policy sees the wrong state. Solution 2
+never looks at the state, so it does not mind; solution 1 loses H(A|O,G), on the crossing h(epsilon). Against that, the type costs
+beta I(G; S,A) = beta (I(G;S) + I(G;A|S)), which is beta I(S;A) more for solution 2. So of the two the naive objective prefers solution 2
+exactly while beta lies below `boundary`; on the crossing with a fair light that is h(epsilon) in bits.
 """
 
 import jax.numpy as jnp

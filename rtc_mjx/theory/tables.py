@@ -4,13 +4,14 @@ Informations and divergences are in nats, as in `rtc_mjx.losses` and `rtc_mjx.di
 `rtc_mjx.metrics` and the command's tables speak. Impossible outcomes (probability zero) count as nothing, and so do their gradients.
 """
 
-import jax
+import math
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rtc_mjx.pytree import pytree
 
-BIT = float(jnp.log(2.0))  # nats
+BIT = math.log(2)  # nats
 
 
 @pytree
@@ -119,13 +120,3 @@ def type_shift(state_type: Float[Array, "states types"], prior: Float[Array, "ty
 
 def _safe_log(p: Array) -> Array:
     return jnp.log(jnp.where(p > 0, p, 1.0))
-
-
-def normalised(table: Float[Array, "..."]) -> Float[Array, "..."]:
-    """The table divided by its sum: for figures that were rounded in print."""
-    return table / jnp.sum(table)
-
-
-def one_hot(choice: Array, outcomes: int) -> Array:
-    """A deterministic choice as probabilities."""
-    return jax.nn.one_hot(choice, outcomes, dtype=jnp.result_type(float))
