@@ -6,6 +6,8 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
+from rtc_mjx import cache
+
 FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 
@@ -23,6 +25,7 @@ def test_notebooks_are_committed_without_outputs(file):
 def test_notebooks_run_and_show_their_figures(file, tmp_path, monkeypatch):
     for name in ("IPYTHONDIR", "JUPYTER_CONFIG_DIR", "JUPYTER_RUNTIME_DIR"):
         monkeypatch.setenv(name, str(tmp_path / name))
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(cache.keep_compiled()))
     notebook = nbformat.read(file, as_version=4)
     NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(FOLDER)}}).execute()
     outputs = [output for cell in code(notebook) for output in cell.outputs]

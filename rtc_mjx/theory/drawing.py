@@ -39,7 +39,7 @@ def _heat(axis: Axes, table: np.ndarray) -> None:
     axis.imshow(table, cmap="Greys", vmin=0, vmax=1.4, aspect="auto")
     axis.set_xticks(range(table.shape[1]), ACTION_NAMES, fontsize=8)
     for (row, column), value in np.ndenumerate(table):
-        axis.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=9)
+        axis.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=9, color="white" if value > 0.7 else "black")
 
 
 def theorem(canvas: FigureBase, found: Comparison, title: str) -> None:
