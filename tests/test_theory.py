@@ -241,6 +241,11 @@ def test_rtc_without_adversarial_loss_is_naive(x64):
     )
 
 
+@pytest.mark.parametrize("method", ["naive_hierarchy_d", "rtc_d"])
+def test_fakes_of_all_branches_make_one_distribution(method):
+    assert sum(learning.share(branch) for branch in METHODS[method].branches) == 1
+
+
 def test_best_discriminator_cannot_tell_the_expert_from_itself(x64):
     expert = solutions.crossing()
     assert np.all(learning.logit(expert, expert.joint) == 0)
