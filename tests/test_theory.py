@@ -81,7 +81,7 @@ def test_a_table_without_doubt_has_finite_gradients(x64):
 def test_solution_1_by_hand(green, left, epsilon, x64):
     """L_rec is the doubt about the light, H(S|O); the type knows nothing of it and all of the turn; both prior and paired err alike."""
     expert = solutions.crossing(green, left)
-    found = solutions.figures(expert, solutions.solution_1(expert, epsilon))
+    found = solutions.measures(expert, solutions.solution_1(expert, epsilon))
     looks_green = green * (1 - epsilon) + (1 - green) * epsilon
     doubt = h(green) + h(epsilon) - h(looks_green)
     assert bits(found.reconstruction) == pytest.approx(doubt, abs=1e-9)
@@ -96,7 +96,7 @@ def test_solution_1_by_hand(green, left, epsilon, x64):
 def test_solution_2_by_hand(green, left, epsilon, x64):
     """Perfect under paired types, and blind under the prior: it runs red lights and waits at green ones."""
     expert = solutions.crossing(green, left)
-    found = solutions.figures(expert, solutions.solution_2(expert, epsilon))
+    found = solutions.measures(expert, solutions.solution_2(expert, epsilon))
     assert float(found.reconstruction) == pytest.approx(0, abs=1e-12) and float(found.error_paired) == pytest.approx(0, abs=1e-12)
     assert float(found.type_information) == pytest.approx(h(green) + green * h(left))
     assert float(found.residual) == pytest.approx(0, abs=1e-9) and float(found.luck) == pytest.approx(1)
@@ -260,31 +260,33 @@ def learned():
 
 
 def test_below_the_boundary_naive_types_hold_luck_and_fail_under_the_prior(learned):
-    found = learned["naive_hierarchy_d"].along_type_kl(0.05, 0.0).figures
+    found = learned["naive_hierarchy_d"].along_type_kl(0.05, 0.0).measures
     assert np.mean(found.luck[0]) > 0.5 and np.mean(found.luck[0] > 0.25) > 0.7
     assert np.mean(found.error_prior[0]) > 4 * np.mean(found.error_paired[0]) and np.min(found.mind[0]) > 0.9
 
 
 def test_above_the_boundary_naive_types_hold_no_luck(learned):
-    found = learned["naive_hierarchy_d"].along_type_kl(0.05, 0.0).figures
+    found = learned["naive_hierarchy_d"].along_type_kl(0.05, 0.0).measures
     assert np.max(found.luck[1]) < 0.05 and np.max(found.error_prior[1]) < 0.11
 
 
 def test_rtc_finds_solution_1_where_naive_does_not(learned):
-    found = learned["rtc_d"].along_type_kl(0.05, 0.3).figures
+    found = learned["rtc_d"].along_type_kl(0.05, 0.3).measures
     assert np.max(found.luck) < 0.05 and np.min(found.mind) > 0.9
     assert np.max(found.error_prior) < 0.1
 
 
 def test_a_learned_prior_is_the_encoders_marginal(learned):
     for results in learned.values():
-        assert np.max(results.figures.marginal_shift) < 1e-3
+        assert np.max(results.measures.marginal_shift) < 1e-3
 
 
 def test_the_grid_holds_every_combination_and_parts_come_out_in_order(learned):
     part = learned["rtc_d"].along_type_kl(0.05, 0.3)
     assert np.allclose(part.settings.type_kl, [0.2, 0.5]) and np.allclose(part.settings.adversarial, 0.3)
-    assert part.figures.luck.shape == (2, 8)
+    assert part.measures.luck.shape == (2, 8)
+    with pytest.raises(UsageError, match=r"lambda 7 was not swept"):
+        learned["rtc_d"].along_type_kl(0.05, 7)
 
 
 def test_the_command_prints_tables_and_writes_figure_and_json(tmp_path, capsys, monkeypatch):
@@ -295,7 +297,7 @@ def test_the_command_prints_tables_and_writes_figure_and_json(tmp_path, capsys, 
     assert "β*" in capsys.readouterr().out and figure.read_bytes().startswith(b"\x89PNG")
     held = json.loads(file.read_text())
     assert len(held["solutions"]) == 2 and held["theorem"]["census"]["deterministic"]["instances"] <= 50
-    assert np.shape(held["learned"]["rtc_d"]["figures"]["luck"]) == (6, 2)
+    assert np.shape(held["learned"]["rtc_d"]["measures"]["luck"]) == (6, 2)
 
 
 @pytest.mark.parametrize(

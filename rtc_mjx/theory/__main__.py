@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     cache.keep_compiled()
     console = Console(width=None if sys.stdout.isatty() else 130)
     expert, settings = solutions.crossing(), learning.grid(learning.EPSILONS, learning.TYPE_KLS, learning.ADVERSARIALS)
-    rows = {(e, n): solutions.figures(expert, solve(expert, e)) for e in learning.EPSILONS for n, solve in SOLUTIONS.items()}
+    rows = {(e, n): solutions.measures(expert, solve(expert, e)) for e in learning.EPSILONS for n, solve in SOLUTIONS.items()}
     console.print(printing.solutions_table(expert, rows))
     found = {name: theorem.compared(name, options.instances) for name in theorem.HYPOTHESES}
     counts = {name: theorem.census(c) for name, c in found.items()}

@@ -1,4 +1,4 @@
-"""Figures of the tabular story, readable in grey: what the solutions play, the theorem's instances, what is learned.
+"""Measures of the tabular story, readable in grey: what the solutions play, the theorem's instances, what is learned.
 
 Each function draws on the figure, or the part of one, that it is given.
 """
@@ -69,7 +69,7 @@ def learned(canvas: FigureBase, expert: Expert, results: dict[str, Learned], eps
     for axis, (name, label) in zip(axes, panels, strict=True):
         for method, adversarial, line, colour in SHOWN:
             part = results[method].along_type_kl(epsilon, adversarial)
-            values, beta = np.asarray(getattr(part.figures, name)), np.asarray(part.settings.type_kl)
+            values, beta = np.asarray(getattr(part.measures, name)), np.asarray(part.settings.type_kl)
             mean = values.mean(axis=1)
             bars = np.stack([mean - values.min(axis=1), values.max(axis=1) - mean])
             tag = f"{'RTC' if method == 'rtc_d' else 'naive'}, λ = {adversarial:g}"

@@ -18,10 +18,11 @@ import optax
 from jax import lax, random
 from jaxtyping import Array, Float, Int
 
+from rtc_mjx.errors import UsageError
 from rtc_mjx.methods import METHODS, Branch, Method
 from rtc_mjx.pytree import pytree
 from rtc_mjx.theory import solutions, tables
-from rtc_mjx.theory.solutions import TYPES, Figures
+from rtc_mjx.theory.solutions import TYPES, Measures
 from rtc_mjx.theory.tables import Expert, TypedAgent
 
 LARGEST_LOGIT = 6.0  # of D: what the expert never does would make it infinite; a regularised D stays finite too
@@ -136,15 +137,21 @@ class Learned:
 
     Attributes:
         settings: along one axis.
-        figures: with axes (settings, seeds).
+        measures: with axes (settings, seeds).
     """
 
     settings: Setting
-    figures: Figures
+    measures: Measures
 
     def along_type_kl(self, epsilon: float, adversarial: float) -> "Learned":
-        """The part of one epsilon and one lambda; what is left varies in beta."""
+        """The part of one epsilon and one lambda; what is left varies in beta.
+
+        Raises:
+            UsageError: the sweep did not go there.
+        """
         here = jnp.isclose(self.settings.epsilon, epsilon) & jnp.isclose(self.settings.adversarial, adversarial)
+        if not jnp.any(here):
+            raise UsageError(f"epsilon {epsilon:g} with lambda {adversarial:g} was not swept; see `settings` for what was")
         return jax.tree.map(lambda x: x[jnp.flatnonzero(here)], self)
 
 
@@ -152,8 +159,8 @@ class Learned:
 def sweep(expert: Expert, method: str, settings: Setting, seeds: int, updates: int) -> Learned:
     """What a method learns at every setting from every seed."""
 
-    def one(setting: Setting, seed: Array) -> Figures:
-        return solutions.figures(expert, learned(expert, METHODS[method], setting, seed, updates))
+    def one(setting: Setting, seed: Array) -> Measures:
+        return solutions.measures(expert, learned(expert, METHODS[method], setting, seed, updates))
 
     over_seeds = jax.vmap(one, in_axes=(None, 0))
     return Learned(settings, jax.vmap(over_seeds, in_axes=(0, None))(settings, jnp.arange(seeds)))

@@ -8,7 +8,7 @@ from rich.table import Table
 
 from rtc_mjx.theory import learning, solutions, theorem
 from rtc_mjx.theory.learning import Learned
-from rtc_mjx.theory.solutions import Figures
+from rtc_mjx.theory.solutions import Measures
 from rtc_mjx.theory.tables import BIT, Expert
 from rtc_mjx.theory.theorem import Comparison
 
@@ -27,7 +27,7 @@ LAST_STEP_HEADS = ("claim holds,\nlast step fails", "H(Â) ≥ H(A) too,\nlast s
 EXAMPLE_HEADS = ("I(S,A)", "I(S,Â)", "H(A)", "H(Â)", "H(A|S)", "H(Â|S)", "H(Â|G)", "claim", "last step")
 
 
-def solutions_table(expert: Expert, rows: dict[tuple[float, str], Figures]) -> Table:
+def solutions_table(expert: Expert, rows: dict[tuple[float, str], Measures]) -> Table:
     """Both solutions beside each other."""
     told = float(next(iter(rows.values())).information)
     table = _table(f"The crossing: expert's I(S,A) {told:.2f} bits", "ε", ("solution", *SOLUTION_HEADS.values(), "β*"))
@@ -70,7 +70,7 @@ def learned_table(expert: Expert, results: dict[str, Learned]) -> Table:
     heads = ("β", "", *(f"{NAMES[m]}\nλ = {x:g}" for m, x in shown))
     table = _table("Learned: luck in types, error under the prior (means over seeds)", "ε", heads)
     for epsilon in learning.EPSILONS:
-        parts = [results[m].along_type_kl(epsilon, x).figures for m, x in shown]
+        parts = [results[m].along_type_kl(epsilon, x).measures for m, x in shown]
         turn = float(solutions.boundary(expert, epsilon))
         for index, beta in enumerate(learning.TYPE_KLS):
             cells = (f"{float(np.mean(p.luck[index])):.2f} {float(np.mean(p.error_prior[index])):.3f}" for p in parts)
@@ -89,13 +89,13 @@ def _table(title: str, first: str, others: tuple[str, ...]) -> Table:
 
 
 def as_json(
-    rows: dict[tuple[float, str], Figures], counts: dict[str, dict[str, int]], two: dict[str, Comparison], results: dict[str, Learned]
+    rows: dict[tuple[float, str], Measures], counts: dict[str, dict[str, int]], two: dict[str, Comparison], results: dict[str, Learned]
 ) -> dict[str, Any]:
-    """Everything that was found; comparisons in nats, figures in the units that `solutions.Figures` says."""
+    """Everything that was found; comparisons in nats, measures in the units that `solutions.Measures` says."""
     return {
         "solutions": [{"epsilon": epsilon, "solution": name, **_plain(row)} for (epsilon, name), row in rows.items()],
         "theorem": {"census": counts, "examples": {name: _plain(c) for name, c in two.items()}},
-        "learned": {m: {"settings": _plain(r.settings), "figures": _plain(r.figures)} for m, r in results.items()},
+        "learned": {m: {"settings": _plain(r.settings), "measures": _plain(r.measures)} for m, r in results.items()},
     }
 
 

@@ -24,7 +24,7 @@ TYPES = 3  # as many as there are actions, so that solution 2 has room
 
 
 @pytree
-class Figures:
+class Measures:
     """What is told of an agent beside its expert; informations in bits.
 
     Attributes:
@@ -108,14 +108,14 @@ def boundary(expert: Expert, epsilon: float | Array) -> Float[Array, ""]:
     return lost / (type_kl(expert, second) - type_kl(expert, first))
 
 
-def figures(expert: Expert, agent: TypedAgent) -> Figures:
+def measures(expert: Expert, agent: TypedAgent) -> Measures:
     """All that is told of an agent."""
     types = agent.seen_types(expert)
     everything = expert.joint[..., None] * agent.encoder
     paired, prior = agent.played(types), agent.played(agent.prior_types(expert))
     said = tables.mutual_information(everything.reshape(-1, everything.shape[-1]))
     luck, information = tables.conditional_shift(types), tables.mutual_information(expert.joint)
-    return Figures(
+    return Measures(
         reconstruction=reconstruction(expert, agent),
         type_information=said / BIT,
         conditional_shift=luck / BIT,

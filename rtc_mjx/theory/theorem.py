@@ -25,6 +25,8 @@ from jaxtyping import Array, Float
 from rtc_mjx.pytree import pytree
 from rtc_mjx.theory import tables
 
+Values = Array | np.ndarray  # random instances are drawn and counted in numpy, compared in JAX
+
 STATES, TYPE_COUNT, ACTIONS = 3, 2, 4  # of a random instance; actions enough for each type to have its own
 MARGIN = 1e-9  # nats: smaller differences are rounding
 NEARLY = 0.02  # with what probability the nearly state-blind policy looks at the state
@@ -39,8 +41,8 @@ class Instance:
         policy: pi(a|s,g).
     """
 
-    state_type: Float[Array | np.ndarray, "*batch states types"]
-    policy: Float[Array | np.ndarray, "*batch states types actions"]
+    state_type: Float[Values, "*batch states types"]
+    policy: Float[Values, "*batch states types actions"]
 
 
 @pytree
@@ -56,50 +58,50 @@ class Comparison:
         residual_hat: H(A_hat | G), what the type leaves open at test.
     """
 
-    information: Float[Array, "*batch"]
-    information_hat: Float[Array, "*batch"]
-    entropy: Float[Array, "*batch"]
-    entropy_hat: Float[Array, "*batch"]
-    shift: Float[Array, "*batch"]
-    residual_hat: Float[Array, "*batch"]
+    information: Float[Values, "*batch"]
+    information_hat: Float[Values, "*batch"]
+    entropy: Float[Values, "*batch"]
+    entropy_hat: Float[Values, "*batch"]
+    shift: Float[Values, "*batch"]
+    residual_hat: Float[Values, "*batch"]
 
     @property
-    def noise(self) -> Array:
+    def noise(self) -> Values:
         """H(A | S)."""
         return self.entropy - self.information
 
     @property
-    def noise_hat(self) -> Array:
+    def noise_hat(self) -> Values:
         """H(A_hat | S)."""
         return self.entropy_hat - self.information_hat
 
     @property
-    def shifted(self) -> Array:
+    def shifted(self) -> Values:
         """The theorem's hypothesis: there is conditional type shift."""
         return self.shift > MARGIN
 
     @property
-    def bounded(self) -> Array:
+    def bounded(self) -> Values:
         """The hypothesis under which we can prove the claim: H(A_hat | G) < I(S, A)."""
         return self.residual_hat < self.information - MARGIN
 
     @property
-    def claim(self) -> Array:
+    def claim(self) -> Values:
         """I(S, A_hat) < I(S, A)."""
         return self.information_hat < self.information - MARGIN
 
     @property
-    def reversed(self) -> Array:
+    def reversed(self) -> Values:
         """I(S, A_hat) > I(S, A): the claim does not just miss by a tie."""
         return self.information_hat > self.information + MARGIN
 
     @property
-    def as_varied(self) -> Array:
+    def as_varied(self) -> Values:
         """The condition that the last step needs: H(A_hat) >= H(A)."""
         return self.entropy_hat >= self.entropy - MARGIN
 
     @property
-    def last_step(self) -> Array:
+    def last_step(self) -> Values:
         """H(A_hat | S) > H(A | S)."""
         return self.noise_hat > self.noise
 
