@@ -1,0 +1,73 @@
+"""Conditional type shift in tables: the paper's two solutions, its Theorem 1 on random instances, and which solution is learned.
+
+Exact, no sampling; the same numbers every time. Informations in bits, losses in nats, errors as shares of actions (total variation).
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from rtc_mjx import cache, cli
+from rtc_mjx.errors import UsageError
+from rtc_mjx.files import write_whole
+from rtc_mjx.theory import drawing, learning, printing, solutions, theorem
+
+DRAWN = 0.05  # the epsilon of the figure
+DRAWN_HYPOTHESIS = "deterministic"
+SOLUTIONS = {"1": solutions.solution_1, "2": solutions.solution_2}
+EXAMPLES = {"counterexample to the last step": theorem.counterexample, "breaks the claim": theorem.breaking}
+
+
+def arguments() -> argparse.ArgumentParser:
+    """The command's options."""
+    parser = cli.Parser(prog="python -m rtc_mjx.theory", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--instances", type=int, default=5000, help="random instances for each hypothesis (default %(default)s)")
+    parser.add_argument("--seeds", type=int, default=16, help="starts of each learned agent (default %(default)s)")
+    parser.add_argument("--updates", type=int, default=3000, help="of each learned agent (default %(default)s)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write everything as JSON")
+    parser.add_argument("--figure", type=Path, metavar="FILE.png", help="draw it")
+    return parser
+
+
+def checked(options: argparse.Namespace) -> argparse.Namespace:
+    """The options.
+
+    Raises:
+        UsageError: a count is not positive, or a file's folder is not there.
+    """
+    for name in ("instances", "seeds", "updates"):
+        if getattr(options, name) < 1:
+            raise UsageError(f"--{name} {getattr(options, name)}: at least 1 is needed")
+    for path in (options.json, options.figure):
+        if path is not None and not path.absolute().parent.is_dir():
+            raise UsageError(f"{path}: there is no folder {path.absolute().parent}")
+    return options
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Tells it all, the quick parts first."""
+    options = checked(arguments().parse_args(argv))
+    cache.keep_compiled()
+    console = Console(width=None if sys.stdout.isatty() else 130)
+    expert, settings = solutions.crossing(), learning.grid(learning.EPSILONS, learning.TYPE_KLS, learning.ADVERSARIALS)
+    rows = {(e, n): solutions.measures(expert, solve(expert, e)) for e in learning.EPSILONS for n, solve in SOLUTIONS.items()}
+    console.print(printing.solutions_table(expert, rows))
+    found = {name: theorem.compared(name, options.instances) for name in theorem.HYPOTHESES}
+    counts = {name: theorem.census(c) for name, c in found.items()}
+    examples = {name: theorem.example(make) for name, make in EXAMPLES.items()}
+    console.print(printing.theorem_table(counts))
+    console.print(printing.examples_table(examples))
+    results = {name: learning.sweep(expert, name, settings, options.seeds, options.updates) for name in printing.NAMES}
+    console.print(printing.learned_table(expert, results))
+    if options.json:
+        write_whole(options.json, json.dumps(printing.as_json(rows, counts, examples, results), indent=1) + "\n")
+    if options.figure:
+        drawing.everything(options.figure, expert, found[DRAWN_HYPOTHESIS], results, DRAWN)
+
+
+if __name__ == "__main__":
+    cli.run(main)

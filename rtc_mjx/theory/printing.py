@@ -1,0 +1,103 @@
+"""What the command prints and writes: tables for the eye, plain values for JSON."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from rich.table import Table
+
+from rtc_mjx.theory import learning, solutions, theorem
+from rtc_mjx.theory.learning import Learned
+from rtc_mjx.theory.solutions import Measures
+from rtc_mjx.theory.tables import BIT, Expert
+from rtc_mjx.theory.theorem import Comparison
+
+NAMES = {"naive_hierarchy_d": "naive", "rtc_d": "RTC"}
+SOLUTION_HEADS = {
+    "reconstruction": "L_rec nats",
+    "type_information": "I(G;S,A)",
+    "conditional_shift": "I(G;S)",
+    "residual": "H(A|G)",
+    "information_prior": "I(S,Â) prior",
+    "error_paired": "error paired",
+    "error_prior": "error prior",
+}
+CENSUS_HEADS = ("instances", "I(S,Â) <\nI(S,A)", "reversed", "H(Â|G) <\nI(S,A)", "claim then\nfails")
+LAST_STEP_HEADS = ("claim holds,\nlast step fails", "H(Â) ≥ H(A) too,\nlast step fails")
+EXAMPLE_HEADS = ("I(S,A)", "I(S,Â)", "H(A)", "H(Â)", "H(A|S)", "H(Â|S)", "H(Â|G)", "claim", "last step")
+
+
+def solutions_table(expert: Expert, rows: dict[tuple[float, str], Measures]) -> Table:
+    """Both solutions beside each other."""
+    told = float(next(iter(rows.values())).information)
+    table = _table(f"The crossing: expert's I(S,A) {told:.2f} bits", "ε", ("solution", *SOLUTION_HEADS.values(), "β*"))
+    for (epsilon, name), row in rows.items():
+        turn = f"{float(solutions.boundary(expert, epsilon)):.3f}" if name == "2" else ""
+        cells = (f"{abs(float(getattr(row, column))):.3f}" for column in SOLUTION_HEADS)  # abs: no minus before a zero
+        table.add_row(f"{epsilon:g}", name, *cells, turn, end_section=name == "2")
+    table.caption = "Below β* the naive objective is less at solution 2 than at solution 1."
+    return table
+
+
+def theorem_table(counts: dict[str, dict[str, int]]) -> Table:
+    """The census of all hypotheses."""
+    heads = (*CENSUS_HEADS, *LAST_STEP_HEADS)
+    table = _table("Theorem 1: random instances with conditional type shift", "hypothesis", heads)
+    for name, row in counts.items():
+        claim, reverse, bounded = (f"{row[k] / max(1, row['instances']):.1%}" for k in ("claim", "reversed", "bounded"))
+        failed = f"{row['last_step_fails'] / max(1, row['claim']):.1%}"
+        last = f"{row['as_varied_and_last_step_fails']} of {row['as_varied']}"
+        table.add_row(name, str(row["instances"]), claim, reverse, bounded, str(row["bounded_without_claim"]), failed, last)
+    most = float(theorem.fano(theorem.NEARLY, theorem.ACTIONS)) / BIT
+    table.caption = f"Nearly state-blind: but with probability {theorem.NEARLY:g}, so that H(Â|G) is at most {most:.3f} bits."
+    return table
+
+
+def examples_table(found: dict[str, Comparison]) -> Table:
+    """The two instances that were not drawn at random."""
+    table = _table("Two instances, in bits", "instance", EXAMPLE_HEADS)
+    for name, c in found.items():
+        values = (c.information, c.information_hat, c.entropy, c.entropy_hat, c.noise, c.noise_hat, c.residual_hat)
+        verdicts = ("holds" if held else "fails" for held in (c.claim, c.last_step))
+        table.add_row(name, *(f"{float(v) / BIT:.4f}" for v in values), *verdicts)
+    return table
+
+
+def learned_table(expert: Expert, results: dict[str, Learned]) -> Table:
+    """Luck in the types and error under the prior, means over seeds."""
+    both = ((method, weight) for method in results for weight in learning.ADVERSARIALS)
+    shown = [(method, weight) for method, weight in both if method != "rtc_d" or weight > 0]  # without L_adv RTC is naive
+    heads = ("β", "", *(f"{NAMES[m]}\nλ = {x:g}" for m, x in shown))
+    table = _table("Learned: luck in types, error under the prior (means over seeds)", "ε", heads)
+    for epsilon in learning.EPSILONS:
+        parts = [results[m].along_type_kl(epsilon, x).measures for m, x in shown]
+        turn = float(solutions.boundary(expert, epsilon))
+        for index, beta in enumerate(learning.TYPE_KLS):
+            cells = (f"{float(np.mean(p.luck[index])):.2f} {float(np.mean(p.error_prior[index])):.3f}" for p in parts)
+            last = beta == learning.TYPE_KLS[-1]
+            table.add_row(f"{epsilon:g}", f"{beta:g}", "< β*" if beta < turn else "", *cells, end_section=last)
+    table.caption = "Luck: I(G;S) / I(S;A), 0 for solution 1, 1 for solution 2. Naive: L_rec + β L_kl + λ L_adv under paired types alone."
+    return table
+
+
+def _table(title: str, first: str, others: tuple[str, ...]) -> Table:
+    table = Table(title=title)
+    table.add_column(first)
+    for head in others:
+        table.add_column(head, justify="right")
+    return table
+
+
+def as_json(
+    rows: dict[tuple[float, str], Measures], counts: dict[str, dict[str, int]], two: dict[str, Comparison], results: dict[str, Learned]
+) -> dict[str, Any]:
+    """Everything that was found; comparisons in nats, measures in the units that `solutions.Measures` says."""
+    return {
+        "solutions": [{"epsilon": epsilon, "solution": name, **_plain(row)} for (epsilon, name), row in rows.items()],
+        "theorem": {"census": counts, "examples": {name: _plain(c) for name, c in two.items()}},
+        "learned": {m: {"settings": _plain(r.settings), "measures": _plain(r.measures)} for m, r in results.items()},
+    }
+
+
+def _plain(value: Any) -> Any:
+    return jax.tree.map(lambda x: np.asarray(x).tolist(), vars(value))
