@@ -63,9 +63,8 @@ def read(data: bytes, source: str) -> Recording:
     wanted = metadata.get("tracks_to_predict")
     chosen = [whole(p.get("track_index") if isinstance(p, dict) else p, -1) for p in wanted] if isinstance(wanted, list) else None
     sdc = whole(metadata.get("sdc_track_index"), -1)
-    refuse_if(
-        any(not 0 <= i < len(objects) for i in chosen or []), source, f"tracks_to_predict names track {chosen}; there are {len(objects)}"
-    )
+    unknown = [i for i in chosen or [] if not 0 <= i < len(objects)]
+    refuse_if(bool(unknown), source, f"tracks_to_predict names tracks {unknown[:5]}; there are {len(objects)}")
     refuse_if(not -1 <= sdc < len(objects), source, f"sdc_track_index is {sdc}; there are {len(objects)} objects")
     return Recording(
         scenario=name(held.get("scenario_id")) or name(held.get("name")),

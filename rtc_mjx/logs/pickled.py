@@ -9,7 +9,7 @@ import io
 import pickletools
 import re
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -43,7 +43,7 @@ class DType:
         """The array of some bytes, or of a list of plain values; never larger than what was read."""
         if not isinstance(shape, tuple) or not all(isinstance(n, int) and 0 <= n < 2**32 for n in shape) or len(shape) > 4:
             raise Refused(f"an array of shape {str(shape)[:40]}")
-        order = "F" if fortran else "C"
+        order: Literal["F", "C"] = "F" if fortran else "C"
         if self.code.startswith("O"):
             if not isinstance(data, list):
                 raise Refused("an array of objects that is no list")
@@ -146,7 +146,7 @@ class Machine:
             if not all(isinstance(key, Key) for key in items[::2]) or len(items) % 2:
                 raise Refused("dictionary keys that are neither text nor numbers")
             target.update(zip(items[::2], items[1::2], strict=True))
-        else:
+        elif isinstance(target, list):
             target.extend(items)
 
     def call(self) -> None:
@@ -230,7 +230,6 @@ OPERATIONS: dict[str, Callable[[Machine, Any], None]] = {
     "GLOBAL": lambda machine, name: machine.stack.append(Name(*name.split(" ", 1))),
     "STACK_GLOBAL": lambda machine, _: machine.stack.append(Name(*machine.take(2))),
     "REDUCE": lambda machine, _: machine.call(), "BUILD": lambda machine, _: machine.build(),
-    "POP": lambda machine, _: machine.take(1) and None,
 }  # fmt: skip
 
 
@@ -255,9 +254,8 @@ def load(data: bytes, source: str) -> Any:
     except Refused as why:
         raise UsageError(f"{source}: its pickle holds {why}, which no recorded scene needs; it was not carried out") from why
     except (ValueError, IndexError, TypeError, OverflowError, MemoryError) as error:
-        raise UsageError(
-            f"{source}: its pickle is damaged: {str(error).splitlines()[0] if str(error) else type(error).__name__}"
-        ) from error
+        cause = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UsageError(f"{source}: its pickle is damaged: {cause}") from error
     if len(machine.stack) != 1:
         raise UsageError(f"{source}: its pickle is damaged: {len(machine.stack)} values are left on its stack")
     return machine.stack[0]

@@ -50,14 +50,16 @@ def files(paths: Iterable[str | Path]) -> list[tuple[Path, bool]]:
             if not match.is_dir():
                 found[match] = True
                 continue
-            inside = sorted(
-                f for f in match.rglob("*") if f.is_file() and not any(part.startswith(".") for part in f.relative_to(match).parts)
-            )
+            inside = [f for f in sorted(match.rglob("*")) if f.is_file() and not _hidden(f.relative_to(match))]
             if not inside:
                 raise UsageError(f"{match}: the folder holds no files")
             for file in inside:
                 found.setdefault(file, False)
     return list(found.items())
+
+
+def _hidden(path: Path) -> bool:
+    return any(part.startswith(".") for part in path.parts)
 
 
 def kind_of(file: Path) -> Kind | Foreign:

@@ -121,7 +121,7 @@ def _map(features: dict[Any, Any], flat_lanes: bool, source: str, repairs: Count
     total, connected = 0, False
     for known, feature in features.items():
         feature, known = dictionary(feature, "a map feature", source), name(known)
-        kind = feature.get("type") if isinstance(feature.get("type"), str) else ""
+        kind = str(feature["type"]) if isinstance(feature.get("type"), str) else ""  # in old files it may be the feature itself
         line = rows(feature.get("polyline", feature.get("polygon", [])), 2 if flat_lanes else 3, "a map feature's points", source)
         line = np.pad(line, [(0, 0), (0, 1)]) if flat_lanes else line
         total += len(line)
@@ -165,9 +165,8 @@ def _neighbours(beside: Any) -> tuple[str, ...]:
 def _signals(states: Any, times: int, source: str, repairs: Counter[str]) -> Signals:
     """Traffic lights by lane; the list by time of the oldest files is empty in all that we have seen, and left out."""
     if not isinstance(states, dict):
-        repairs["signal states of an unknown layout, dropped"] += (
-            sum(bool(x) and x != [{}] for x in states) if isinstance(states, list) else 0
-        )
+        odd = [x for x in states if x and x != [{}]] if isinstance(states, list) else []
+        repairs["signal states of an unknown layout, dropped"] += len(odd)
         return no_signals()
     told: list[tuple[int, str, int, tuple[float, ...]]] = []
     for light, held in states.items():

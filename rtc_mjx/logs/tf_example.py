@@ -67,9 +67,7 @@ class Arrays:
         for part, length in zip(PARTS, lengths, strict=True):
             found = self(f"{group}/{part}/{name}", rows if times_first else length)
             found = found.T if times_first else found
-            refuse_if(
-                found.shape != (rows, length), self.source, f"feature {group}/{part}/{name} has {found.size} numbers, not {rows} x {length}"
-            )
+            refuse_if(found.shape != (rows, length), self.source, f"feature {group}/{part}/{name} is not {rows} x {length}")
             parts.append(found)
         return np.concatenate(parts, axis=1)
 
@@ -150,7 +148,8 @@ def _map(arrays: Arrays, source: str) -> Map:
             held["stop_signs"].append(StopSign(name, points[0], ()))
         else:
             held[AREAS.get(kind, "road_edges" if kind in EDGES else "road_lines")].append(Feature(name, points))
-    return Map(connected=False, **{name: tuple(features) for name, features in held.items()})
+    features: dict[str, Any] = {name: tuple(found) for name, found in held.items()}
+    return Map(connected=False, **features)
 
 
 def _signals(arrays: Arrays, lengths: tuple[int, ...], repairs: dict[str, int]) -> Signals:

@@ -1,5 +1,6 @@
 """Scenario protos of the Waymo Open Motion Dataset: maps with connectivity, signals, tracks_to_predict."""
 
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from rtc_mjx.errors import UsageError
 from rtc_mjx.logs import messages
 from rtc_mjx.logs.recording import (
     MOST_POINTS,
+    OTHER,
     SIGNAL_STATES,
     Feature,
     Lane,
@@ -38,7 +40,7 @@ def read(payload: bytes, source: str) -> Recording:
     """
     scenario = parsed(messages.Scenario, payload, source)
     times = np.array(scenario.timestamps_seconds, float)
-    sdc, repairs = int(scenario.sdc_track_index), dict[str, int]()
+    sdc, repairs = int(scenario.sdc_track_index), Counter[str]()
     tracks = _tracks(scenario.tracks, len(times), source, repairs)
     known = range(len(tracks.ids))
     wanted = [int(p.track_index) for p in scenario.tracks_to_predict]
@@ -57,7 +59,7 @@ def read(payload: bytes, source: str) -> Recording:
         sdc=sdc if named else -1,
         to_predict=tuple(wanted),
         of_interest=tuple(str(i) for i in scenario.objects_of_interest),
-        repairs=repairs,
+        repairs={what: count for what, count in repairs.items() if count},
     )
 
 
@@ -73,27 +75,22 @@ def parsed(message: Any, payload: bytes, source: str) -> Any:
         raise UsageError(f"{source}: it is no {message.DESCRIPTOR.name} message: {str(error).splitlines()[0]}") from error
 
 
-def _tracks(logged: Any, times: int, source: str, repairs: dict[str, int]) -> Tracks:
+def _tracks(logged: Any, times: int, source: str, repairs: Counter[str]) -> Tracks:
     out = empty_tracks(tuple(str(t.id) for t in logged), times, source)
     for i, track in enumerate(logged):
         states = [
             (s.center_x, s.center_y, s.center_z, s.heading, s.velocity_x, s.velocity_y, s.length, s.width, s.height, s.valid)
             for s in track.states[:times]
         ]
-        if len(track.states) != times:
-            repairs["tracks with another number of states than times"] = (
-                repairs.get("tracks with another number of states than times", 0) + 1
-            )
-        out.kinds[i] = track.object_type if 0 <= track.object_type <= 4 else 0
-        if states:
-            numbers = np.array(states, float)
-            there = slice(0, len(states))
-            out.pose[i, there], out.velocity[i, there] = numbers[:, :4], numbers[:, 4:6]
-            out.size[i, there], out.valid[i, there] = numbers[:, 6:9], numbers[:, 9] > 0
+        repairs["tracks with another number of states than times"] += len(track.states) != times
+        out.kinds[i] = track.object_type if 0 <= track.object_type <= OTHER else 0
+        numbers, there = np.array(states, float).reshape(-1, 10), slice(0, len(states))
+        out.pose[i, there], out.velocity[i, there] = numbers[:, :4], numbers[:, 4:6]
+        out.size[i, there], out.valid[i, there] = numbers[:, 6:9], numbers[:, 9] > 0
     return out
 
 
-def read_map(features: Any, source: str, repairs: dict[str, int]) -> Map:
+def read_map(features: Any, source: str, repairs: Counter[str]) -> Map:
     """The map of a Scenario's features."""
     held: dict[str, list[Any]] = {name: [] for name in ("road_edge", "road_line", "crosswalk", "speed_bump", "driveway")}
     lanes, signs, points = [], [], 0
@@ -107,7 +104,7 @@ def read_map(features: Any, source: str, repairs: dict[str, int]) -> Map:
         else:
             name = next((n for n in held if feature.HasField(n)), None)
             if name is None:
-                repairs["map features of an unknown kind"] = repairs.get("map features of an unknown kind", 0) + 1
+                repairs["map features of an unknown kind"] += 1
                 continue
             shape = getattr(feature, name)
             held[name].append(Feature(str(feature.id), _points(shape.polyline if name.startswith("road") else shape.polygon)))
@@ -121,7 +118,7 @@ def read_map(features: Any, source: str, repairs: dict[str, int]) -> Map:
 
 
 def _lane(name: str, lane: Any) -> Lane:
-    kind = LANE_KINDS[lane.type] if 0 <= lane.type < len(LANE_KINDS) else "unknown"
+    kind: LaneKind = LANE_KINDS[lane.type] if 0 <= lane.type < len(LANE_KINDS) else "unknown"
     limit = MPH * lane.speed_limit_mph if lane.HasField("speed_limit_mph") else float("nan")
     entries, exits = (tuple(str(i) for i in ids) for ids in (lane.entry_lanes, lane.exit_lanes))
     left, right = (tuple(str(n.feature_id) for n in beside) for beside in (lane.left_neighbors, lane.right_neighbors))
@@ -132,11 +129,10 @@ def _points(points: Any) -> np.ndarray:
     return np.array([(p.x, p.y, p.z) for p in points], float).reshape(-1, 3)
 
 
-def _signals(states: Any, times: int, repairs: dict[str, int]) -> Signals:
+def _signals(states: Any, times: int, repairs: Counter[str]) -> Signals:
     told = [(i, s) for i, at in enumerate(states) for s in at.lane_states]
     kept = [(i, s) for i, s in told if i < times and 0 <= s.state < len(SIGNAL_STATES)]
-    if len(kept) < len(told):
-        repairs["signal states of an unknown kind or time, dropped"] = len(told) - len(kept)
+    repairs["signal states of an unknown kind or time, dropped"] += len(told) - len(kept)
     nowhere = (float("nan"),) * 3
     stops = [(p.x, p.y, p.z) if s.HasField("stop_point") else nowhere for _, s in kept for p in [s.stop_point]]
     return Signals(
