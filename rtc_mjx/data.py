@@ -226,7 +226,7 @@ def _parser() -> cli.Parser:
     parser.add_argument("--convert", action="store_true", help="keep the converted scenes in the cache")
     parser.add_argument("--render", type=Path, metavar="DIR", help="draw one scene of each recording from above, as PNG")
     scenes = parser.add_argument_group("which scenes")
-    who = "whose: of the self-driving car (sdc), of tracks_to_predict (predict), of every vehicle there throughout that moves (moving, the default)"
+    who = "of the self-driving car (sdc), of tracks_to_predict (predict), of every vehicle there throughout that moves (moving, default)"
     scenes.add_argument("--control", choices=get_args(Control), default=known.control, help=who)
     scenes.add_argument(
         "--start", type=float, default=known.start, metavar="S", help="seconds into the recording (default 0); a scene lasts 9 s"

@@ -16,8 +16,9 @@ from jaxtyping import Float, Int
 
 from rtc_mjx.errors import UsageError
 from rtc_mjx.logs.check import checked
+from rtc_mjx.logs.levels import Level, Samples, level_of, sampled
 from rtc_mjx.logs.recording import OTHER, Recording, Tracks, refuse_if
-from rtc_mjx.logs.road import Connectivity, Roads, other_level, prepare
+from rtc_mjx.logs.road import Connectivity, Roads, prepare
 from rtc_mjx.logs.scene import CYCLIST, VEHICLE, LoggedScene, RoadGraph
 from rtc_mjx.logs.window import cut
 
@@ -144,11 +145,11 @@ def _scene(recording: Recording, tracks: Tracks, roads: Roads, agent: int, optio
     """
     name = f"{recording.scenario or recording.source}/{tracks.ids[agent]}"
     ground = on_the_ground(tracks)
-    path = ground[agent][tracks.valid[agent]][::THINNED]
-    origin = ground[agent, 0]
-    kept = _users(tracks, ground, path, agent, options.road_users, recording.map.heights, notes)
-    graph, signals = _graph(roads, path, origin, options, recording.map.heights, notes)
-    pose, velocity, size, kind, valid = (_room(x, options.road_users) for x in _selected(tracks, kept, origin))
+    origin, path = ground[agent, 0], ground[agent][tracks.valid[agent]][::THINNED]
+    level = level_of(roads, path, float(tracks.pose[agent, 0, 3])) if recording.map.heights else None
+    kept = _users(tracks, ground, agent, level, options.road_users, notes)
+    graph, signals = _graph(roads, origin, level, options, notes)
+    pose, velocity, size, kind, valid = (_room(x, options.road_users) for x in _selected(tracks, kept, origin, notes))
     fields: dict[str, Any] = {
         "road": graph, "signals": signals, "pose": pose, "velocity": velocity, "size": size, "kind": kind, "valid": valid,
         "controlled": np.array(kept.index(agent), np.int32),
@@ -164,29 +165,32 @@ def on_the_ground(tracks: Tracks) -> Float[np.ndarray, "tracks times 3"]:
     return tracks.pose[..., :3] - np.stack([0 * height, 0 * height, height / 2], axis=-1)
 
 
-def _users(tracks: Tracks, ground: np.ndarray, path: np.ndarray, agent: int, most: int, heights: bool, notes: Counter[str]) -> list[int]:
+def _users(tracks: Tracks, ground: np.ndarray, agent: int, level: Level | None, most: int, notes: Counter[str]) -> list[int]:
     """The controlled one first, then the others by how near they come to where it starts."""
     usable = (tracks.kinds >= VEHICLE) & (tracks.kinds <= CYCLIST) & np.any(tracks.valid, axis=1)
     notes["road users of another kind (cones, barriers, animals), left out"] += int(np.sum(tracks.kinds == OTHER))
     notes["road users of no kind, left out"] += int(np.sum(tracks.kinds == 0))
-    nearest = np.full(len(usable), np.inf)
-    for i in np.flatnonzero(usable):
-        there = ground[i][tracks.valid[i]]
-        nearest[i] = np.min(np.linalg.norm(there[:, :2] - path[0, :2], axis=1))
-        above, away = other_level(there, path)
-        if heights and i != agent and above[np.argmin(away)]:
-            notes["road users on another level, left out"] += 1
-            nearest[i] = np.inf
+    if level is not None:
+        seen = tracks.valid & usable[:, None]
+        here = level.holds(Samples(ground[seen], np.nonzero(seen)[0]), len(usable))
+        here[agent] = True
+        notes["road users on another level, left out"] += int(np.sum(usable & ~here))
+        usable &= here
+    away = np.linalg.norm(ground[..., :2] - ground[agent, 0, :2], axis=-1)
+    nearest = np.min(np.where(tracks.valid & usable[:, None], away, np.inf), axis=1)
     nearest[agent] = -1.0
     order = [int(i) for i in np.argsort(nearest, kind="stable") if np.isfinite(nearest[i])]
     notes["road users beyond those that fit"] += max(0, len(order) - most)
     return order[:most]
 
 
-def _selected(tracks: Tracks, kept: list[int], origin: np.ndarray) -> tuple[np.ndarray, ...]:
+def _selected(tracks: Tracks, kept: list[int], origin: np.ndarray, notes: Counter[str]) -> tuple[np.ndarray, ...]:
     valid = tracks.valid[kept]
     pose = tracks.pose[kept][..., [0, 1, 3]] - np.array([*origin[:2], 0.0])
     size = np.stack([_middle(tracks.size[i, tracks.valid[i], :2]) for i in kept])
+    swapped = (tracks.kinds[kept] == VEHICLE) & (size[:, 1] > size[:, 0])  # nuScenes' own car in ScenarioNet
+    notes["vehicles wider than long, length and width exchanged"] += int(np.sum(swapped))
+    size = np.where(swapped[:, None], size[:, ::-1], size)
     there = valid[..., None]
     moved = np.where(there, pose, 0.0).astype(np.float32), np.where(there, tracks.velocity[kept], 0.0).astype(np.float32)
     return (*moved, size.astype(np.float32), tracks.kinds[kept].astype(np.int32), valid)
@@ -202,13 +206,11 @@ def _room(x: np.ndarray, count: int) -> np.ndarray:
     return np.pad(x, [(0, count - len(x)), *[(0, 0)] * (x.ndim - 1)])
 
 
-def _graph(
-    roads: Roads, path: np.ndarray, origin: np.ndarray, options: Options, heights: bool, notes: Counter[str]
-) -> tuple[RoadGraph, np.ndarray]:
+def _graph(roads: Roads, origin: np.ndarray, level: Level | None, options: Options, notes: Counter[str]) -> tuple[RoadGraph, np.ndarray]:
     """The road graph about an agent, and the signals of its lanes."""
-    lanes = _nearest("lanes", roads.lanes, path, origin, options.lanes, heights, notes)
-    edges = _nearest("road edge segments", roads.edges, path, origin, options.edges, heights, notes)
-    crosswalks = _nearest("crosswalks", roads.crosswalks, path, origin, options.crosswalks, heights, notes)
+    lanes = _nearest("lanes", roads.lanes, origin, level, options.lanes, notes)
+    edges = _nearest("road edge segments", roads.edges, origin, level, options.edges, notes)
+    crosswalks = _nearest("crosswalks", roads.crosswalks, origin, level, options.crosswalks, notes)
 
     def moved(x: np.ndarray, count: int) -> np.ndarray:
         return _room((x[..., :2] - origin[:2]).astype(np.float32), count)
@@ -225,21 +227,18 @@ def _graph(
     return RoadGraph(**fields), signals.astype(np.int32)
 
 
-def _nearest(
-    what: str, shapes: np.ndarray, path: np.ndarray, origin: np.ndarray, most: int, heights: bool, notes: Counter[str]
-) -> Int[np.ndarray, "kept"]:
+def _nearest(what: str, shapes: np.ndarray, origin: np.ndarray, level: Level | None, most: int, notes: Counter[str]) -> np.ndarray:
     """Of lines or areas, those on the agent's level, nearest to where it starts first, which tells nothing of its future."""
-    count = len(shapes)
-    if not count:
+    if not len(shapes):
         return np.zeros(0, int)
-    flat = shapes.reshape(-1, 3)
-    above, away = (x.reshape(count, -1) for x in other_level(flat, path))
-    elsewhere = above[np.arange(count), np.argmin(away, axis=1)] & heights
-    notes[f"{what} on another level, left out"] += int(np.sum(elsewhere))
+    here = level.holds(sampled(shapes), len(shapes)) if level else np.ones(len(shapes), bool)
+    if level and what == "lanes":
+        here[list(level.lanes)] = True
     reach = np.min(_to_segments(shapes, origin), axis=1)
-    order = [int(i) for i in np.argsort(np.where(elsewhere, np.inf, reach), kind="stable")[: count - int(np.sum(elsewhere))]]
+    order = np.argsort(np.where(here, reach, np.inf), kind="stable")[: int(np.sum(here))]
+    notes[f"{what} on another level, left out"] += int(np.sum(~here))
     notes[f"{what} beyond those that fit"] += max(0, len(order) - most)
-    return np.array(order[:most], int)
+    return order[:most]
 
 
 def _to_segments(shapes: np.ndarray, point: np.ndarray) -> np.ndarray:

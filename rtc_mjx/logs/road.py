@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from rtc_mjx.logs.recording import SIGNAL_STATES, Lane, Recording
 from rtc_mjx.logs.scene import AMBER, GREEN, NO_SIGNAL, RED
@@ -235,23 +235,3 @@ def four_corners(area: Float[np.ndarray, "corners 3"]) -> Float[np.ndarray, "4 3
             corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]]) @ axes
             best = corners if sides[0] >= sides[1] else np.roll(corners, -1, axis=0)
     return np.concatenate([best, np.full((4, 1), np.mean(area[:, 2]))], axis=1)
-
-
-def other_level(
-    points: Float[np.ndarray, "points 3"], path: Float[np.ndarray, "poses 3"], clearance: float = 2.5, slope: float = 0.08
-) -> tuple[Bool[np.ndarray, "points"], Float[np.ndarray, "points"]]:
-    """Whether points are above or below a path: by more than a vehicle's clearance (m) and what a road climbs on the way there.
-
-    Args:
-        points: with their height above sea.
-        path: points on the ground.
-        clearance: of a bridge is 4.5 m or more; what varies less belongs to the same road.
-        slope: of roads, at most, m/m.
-
-    Returns:
-        For each point, whether, and how far it is in the plane from the path.
-    """
-    away = np.linalg.norm(points[:, None, :2] - path[None, :, :2], axis=-1)
-    nearest = np.argmin(away, axis=1)
-    distance = away[np.arange(len(points)), nearest]
-    return np.abs(points[:, 2] - path[nearest, 2]) > clearance + slope * distance, distance
