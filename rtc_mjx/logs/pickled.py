@@ -15,7 +15,7 @@ import numpy as np
 
 from rtc_mjx.errors import UsageError
 
-MOST_OPERATIONS = 2_000_000  # real scenes have one or two hundred thousand
+MOST_OPERATIONS = 1_000_000  # real scenes have one or two hundred thousand
 DTYPE = re.compile(r"[biuf][1248]|U\d{1,4}|S\d{1,4}|O8?")
 MARK = object()
 Key = str | int | float | bool | None
@@ -48,7 +48,8 @@ class DType:
             if not isinstance(data, list):
                 raise Refused("an array of objects that is no list")
             flat = np.empty(len(data), object)
-            flat[:] = data
+            for i, value in enumerate(data):  # at once, numpy would look into nested lists, which may be endless
+                flat[i] = value
         else:
             dtype = np.dtype(self.order + self.code)
             if not isinstance(data, bytes | bytearray) or not dtype.itemsize:
