@@ -160,7 +160,7 @@ def malicious(flag: Path) -> dict[str, bytes]:
     shared: list[Any] = [1.0] * 10
     for _ in range(30):
         shared = [shared] * 10
-    many = b"".join((b"\x80\x04", b"]" * 3_000_000, b"."))
+    many = b"".join((b"\x80\x04", b"]" * 1_100_000, b"."))
     nested = b"".join((b"\x80\x04}", b")" + b"\x85" * 200_000, b"Ns."))
     return {
         "system": pickle.dumps(Bomb(os.system, f"touch {flag}")),

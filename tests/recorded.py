@@ -138,14 +138,14 @@ def example(held: dict[str, np.ndarray], name: str = "made") -> bytes:
 def gpudrive(degrees: bool = False, old: bool = False) -> dict[str, Any]:
     """GPUDrive JSON; old files lack heights, ids, lane types, scenario id and metadata."""
 
-    def point(x: float, y: float) -> dict[str, float]:
-        return {k: v for k, v in place(x, y).items() if not (old and k == "z")}
+    def point(x: float, y: float, z: float = 0.0) -> dict[str, float]:
+        return {k: v for k, v in place(x, y, z).items() if not (old and k == "z")}
 
     turn = 370.0 if degrees else 0.01
     objects = []
     for known, kind, x, y, speed, length, width in TRACKS:
         held = {
-            "position": [point(x + speed * i / 10, y) for i in range(STEPS)], "heading": [turn] * STEPS, "valid": [True] * STEPS,
+            "position": [point(x + speed * i / 10, y, 0.8) for i in range(STEPS)], "heading": [turn] * STEPS, "valid": [True] * STEPS,
             "velocity": [{"x": speed, "y": 0.0}] * STEPS, "width": width, "length": length, "type": ["", "vehicle", "pedestrian"][kind],
             "goalPosition": point(x, y),
         }  # fmt: skip

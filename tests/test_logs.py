@@ -2,15 +2,11 @@
 
 import dataclasses
 import json
-import multiprocessing
-import os
 import pickle
-import random
 import signal
 import subprocess
 import sys
 import time
-import warnings
 from collections import Counter
 from pathlib import Path
 
@@ -200,7 +196,7 @@ def test_a_later_start_is_a_later_scene(tmp_path):
     slower = dataclasses.replace(made("womd_scenario", tmp_path), times=np.arange(91) / 5)
     early, late = (convert(slower, dataclasses.replace(SMALL, start=s)).scenes[0] for s in (0.0, 4.0))
     assert np.allclose(late.origin - early.origin, [20.0, 0.0, 0.0], atol=1e-6)
-    assert [late.scene.signals[t, 1] for t in (0, 39, 41)] == [RED, RED, AMBER]
+    assert [late.scene.signals[t, 1] for t in (0, 38, 41)] == [RED, RED, AMBER]
 
 
 def test_what_does_not_fit_is_dropped_farthest_first_and_counted(tmp_path):
@@ -218,8 +214,8 @@ def test_simplified_lines_stay_where_they_were():
     line = np.concatenate([np.stack([np.linspace(-80, 0, 160), np.zeros(160)], 1), 20 * np.stack([np.sin(angle), 1 - np.cos(angle)], 1)])
     kept, off = simplified(line, 32)
     assert off <= 0.05 and len(kept) < 32 and kept[:2] != [0, 1]  # the straight part needs no points
-    polyline = np.concatenate([np.linspace(line[a], line[b], 50) for a, b in zip(kept[:-1], kept[1:], strict=True)])
-    assert max(np.min(np.linalg.norm(polyline - p, axis=1)) for p in line) < 0.5 + 0.05
+    polyline = np.concatenate([np.linspace(line[a], line[b], 800) for a, b in zip(kept[:-1], kept[1:], strict=True)])
+    assert max(np.min(np.linalg.norm(polyline - p, axis=1)) for p in line) < 0.05 + 0.06
     rough, more = simplified(line, 4)
     assert len(rough) == 4 and more > 0.3
 
@@ -289,8 +285,10 @@ def test_what_passes_below_a_bridge_is_left_out_and_what_is_on_it_stays(tmp_path
     scene = conversion.scenes[0]
     assert scene.users == ("11", "12", "13")
     assert conversion.dropped == {
-        "road users on another level, left out": 1, "lanes on another level, left out": 1, "road edge segments on another level, left out": 2,
-    }  # fmt: skip
+        "road users on another level, left out": 1,
+        "lanes on another level, left out": 1,
+        "road edge segments on another level, left out": 2,
+    }
     crossing = dataclasses.replace(recording, map=dataclasses.replace(recording.map, heights=False))
     assert "60" in convert(crossing, dataclasses.replace(SMALL, control="sdc")).scenes[0].users
 
@@ -434,19 +432,17 @@ def test_a_name_that_runs_code_would_be_noticed(tmp_path):
 
 def test_memory_is_flat_over_a_shard(tmp_path):
     payload = recorded.tfrecord(recorded.scenario().SerializeToString())
-    for name, count in (("few", 5), ("many", 300)):
-        with (tmp_path / name).open("wb") as opened:
-            for _ in range(count):
-                opened.write(payload)
+    with (tmp_path / "shard").open("wb") as opened:
+        for _ in range(400):
+            opened.write(payload)
     code = (
         "import resource, sys; from pathlib import Path; from rtc_mjx.logs import read\n"
-        "print(sum(1 for _ in read.recordings(Path(sys.argv[1]))), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+        "for number, _ in enumerate(read.recordings(Path(sys.argv[1]))):\n"
+        "    if number in (20, 399): print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
     )
-    used = {}
-    for name in ("few", "many"):
-        done = subprocess.run([sys.executable, "-c", code, tmp_path / name], capture_output=True, text=True, cwd=ROOT, check=True)
-        count, used[name] = map(int, done.stdout.split())
-    assert count == 300 and used["many"] - used["few"] < 6_000  # kB; the shard has 12,000
+    done = subprocess.run([sys.executable, "-c", code, tmp_path / "shard"], capture_output=True, text=True, cwd=ROOT, check=True)
+    early, late = map(int, done.stdout.split())
+    assert late - early < 3_000  # kB; the shard has 16,000
 
 
 # The cache
@@ -504,36 +500,44 @@ def test_without_a_place_to_keep_them_scenes_are_made_all_the_same(kept, tmp_pat
     assert any("cannot be kept" in r.message for r in caplog.records)
 
 
-def test_an_entry_is_whole_or_not_there_whenever_it_is_killed(kept):
-    """Two processes at once convert a larger shard over and over; they are killed at random moments."""
-    kept.write_bytes(recorded.tfrecord(*(recorded.scenario(f"s{i}").SerializeToString() for i in range(12))))
-    fork = multiprocessing.get_context("spawn")
-    draw, seen = random.Random(3), Counter()
-    for _ in range(3):
-        children = [fork.Process(target=_convert_forever, args=(str(kept),)) for _ in range(2)]
+def test_two_writers_killed_at_any_moment_leave_a_whole_entry_or_none(kept):
+    """Both convert the same shard over and over; the second lives on for a while. Whatever is left then, the scenes are right."""
+    kept.write_bytes(recorded.tfrecord(*(recorded.scenario(f"s{i}").SerializeToString() for i in range(6))))
+    expected = [scene.name for scene in store.scenes([kept], SMALL)]
+    folder = store.entry(kept, SMALL)
+    code = (
+        "import sys; from pathlib import Path; from rtc_mjx.logs import store; from tests.test_logs import SMALL\n"
+        "print('ready', flush=True)\n"
+        "while True: store.build(Path(sys.argv[1]), SMALL)\n"
+    )
+    children = [subprocess.Popen([sys.executable, "-c", code, str(kept)], cwd=ROOT, stdout=subprocess.PIPE) for _ in range(2)]
+    try:
         for child in children:
-            child.start()
-        folder, limit = store.entry(kept, SMALL), time.monotonic() + 20
-        while not folder.exists() and time.monotonic() < limit:
-            time.sleep(0.005)
-        time.sleep(draw.uniform(0.0, 0.3))
+            assert child.stdout is not None and child.stdout.readline() == b"ready\n"
+        for child, wait in zip(children, (0.37, 0.21), strict=True):
+            time.sleep(wait)
+            child.send_signal(signal.SIGKILL)
+            child.wait()
+            assert store.whole(folder)  # the index is replaced by an equal one, never by half of one
+            assert [scene.name for scene in store.scenes([kept], SMALL)] == expected
+    finally:
         for child in children:
-            assert child.pid is not None
-            os.kill(child.pid, signal.SIGKILL)
-            child.join()
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            seen[store.whole(folder)] += 1
-        assert len(list(store.scenes([kept], SMALL))) == 24
-        for item in folder.iterdir():
-            item.unlink()
-        folder.rmdir()
-    assert sum(seen.values()) == 3
+            child.kill()
+            child.communicate()
 
 
-def _convert_forever(file: str) -> None:
-    while True:
-        store.build(Path(file), SMALL)
+def test_a_first_conversion_that_is_killed_leaves_no_entry(kept, monkeypatch):
+    """Killed after two of three recordings: simulated by an interrupt, as the index is written last."""
+
+    def interrupted(recording: Recording, became: object) -> None:
+        if recording.scenario == "s1":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        store.build(kept, SMALL, interrupted)
+    folder = store.entry(kept, SMALL)
+    assert len(list(folder.glob("*.npz"))) == 2 and not store.whole(folder)
+    assert len(list(store.scenes([kept], SMALL))) == 6 and store.whole(folder)
 
 
 # The recordings that others made
@@ -552,7 +556,7 @@ def test_every_shared_file_loads_and_can_be_driven():
     counts, connectivity, empty = Counter(), {}, []
     for recording in read.stream([recorded.SHARED]):
         counts[recording.kind] += 1
-        conversion = convert(recording, Options())
+        conversion = convert(recording, Options(control="sdc" if recording.sdc >= 0 else "moving"))
         connectivity.setdefault(recording.kind, set()).update(s.connectivity for s in conversion.scenes)
         if not conversion.scenes:
             empty.append(Path(recording.source).name)
