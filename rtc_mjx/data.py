@@ -5,7 +5,7 @@ Examples:
   python -m rtc_mjx.data 'womd/*.tfrecord-*' --convert      convert and keep all scenes
   python -m rtc_mjx.data scene.json --render pictures/      draw them from above
 
-formats, told by content: TFRecords of Waymo Open Motion Dataset Scenario protos or tf.Examples, GPUDrive / Nocturne JSON, ScenarioNet
+Formats, told by content: TFRecords of Waymo Open Motion Dataset Scenario protos or tf.Examples, GPUDrive / Nocturne JSON, ScenarioNet
 pickles (as data only: nothing in them is run).
 """
 

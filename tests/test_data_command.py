@@ -99,4 +99,4 @@ def test_help_explains_every_option(capsys):
         data.main(["--help"])
     told = capsys.readouterr().out
     assert leaving.value.code == 0
-    assert all(option in told for option in ("--convert", "--render DIR", "--control", "--start S", "--lanes N", "examples:"))
+    assert all(option in told for option in ("--convert", "--render DIR", "--control", "--start S", "--lanes N", "Examples:"))

@@ -92,6 +92,7 @@ def read(payload: bytes, source: str) -> Recording:
     slots = len(ids)
     refuse_if(not slots or len(kinds) != slots, source, f"feature state/id has {slots} numbers, state/type {len(kinds)}")
     lengths = tuple(arrays(f"state/{part}/x", 1).size // slots for part in PARTS)
+    refuse_if(not all(lengths), source, f"its past, current and future have {lengths} times; at least one of each is needed")
     rows, repairs = np.flatnonzero(kinds >= 0), dict[str, int]()
     tracks = _tracks(arrays, rows, lengths, ids, kinds)
     flags = {name: arrays.whole(f"state/{name}") if f"state/{name}" in arrays else np.zeros(0) for name in FLAGS}
