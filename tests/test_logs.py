@@ -220,6 +220,28 @@ def test_simplified_lines_stay_where_they_were():
     assert len(rough) == 4 and more > 0.3
 
 
+def test_who_comes_later_waits_where_it_will_appear(tmp_path):
+    recording = made("womd_scenario", tmp_path)
+    recording.tracks.valid[1, :30] = False
+    scene = convert(recording, dataclasses.replace(SMALL, control="sdc")).scenes[0].scene
+    assert (scene.pose[1, :30] == scene.pose[1, 30]).all() and not scene.valid[1, :30].any() and scene.valid[1, 30:].all()
+    assert not scene.velocity[1, :30].any()
+
+
+def test_maps_beyond_all_measure_are_refused(tmp_path):
+    held = recorded.scenario()
+    lane = held.map_features[0].lane
+    lane.exit_lanes.extend([2] * 600_000)
+    with pytest.raises(UsageError, match="more than 500000 points and links"):
+        from_scenario(held)
+    held = recorded.scenario()
+    held.map_features.extend([held.map_features[0]] * 5000)
+    with pytest.raises(UsageError, match="5009 lanes|5004 lanes"):
+        convert(from_scenario(held), SMALL)
+    far = np.array([[[-1e6, 0, 0], [1e6, 0, 0.0]]])
+    assert len(sampled(far).points) == 100
+
+
 def test_an_area_becomes_the_smallest_rectangle_with_its_longer_side_first():
     turn = np.array([[np.cos(0.4), np.sin(0.4)], [-np.sin(0.4), np.cos(0.4)]])
     corners = np.array([[0, 0], [3, 0], [3, 6], [3, 12], [0, 12.0]]) @ turn
@@ -492,6 +514,15 @@ def test_a_damaged_entry_is_made_anew_and_said(kept, damage, caplog):
     again = list(store.scenes([kept], SMALL))
     assert all(same(a, b) for a, b in zip(first, again, strict=True))
     assert sum("made anew" in r.message for r in caplog.records) == 1 and store.whole(folder)
+
+
+def test_what_else_lies_in_a_folder_is_passed_over(kept, tmp_path):
+    (tmp_path / "in").mkdir()
+    kept.rename(tmp_path / "in" / "shard")
+    (tmp_path / "in" / "LICENSE").write_text("terms\n")
+    assert len(list(store.scenes([tmp_path / "in"], SMALL))) == 6
+    with pytest.raises(UsageError, match="no scene can be made"):
+        list(store.scenes([tmp_path / "in"], dataclasses.replace(SMALL, start=5.0)))
 
 
 def test_without_a_place_to_keep_them_scenes_are_made_all_the_same(kept, tmp_path, caplog):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from rtc_mjx.errors import UsageError
 from rtc_mjx.logs.check import checked
@@ -191,9 +191,15 @@ def _selected(tracks: Tracks, kept: list[int], origin: np.ndarray, notes: Counte
     swapped = (tracks.kinds[kept] == VEHICLE) & (size[:, 1] > size[:, 0])  # nuScenes' own car in ScenarioNet
     notes["vehicles wider than long, length and width exchanged"] += int(np.sum(swapped))
     size = np.where(swapped[:, None], size[:, ::-1], size)
-    there = valid[..., None]
-    moved = np.where(there, pose, 0.0).astype(np.float32), np.where(there, tracks.velocity[kept], 0.0).astype(np.float32)
-    return (*moved, size.astype(np.float32), tracks.kinds[kept].astype(np.int32), valid)
+    pose = np.stack([one[_nearest_time(there)] for one, there in zip(pose, valid, strict=True)])
+    velocity = np.where(valid[..., None], tracks.velocity[kept], 0.0)
+    return (*(x.astype(np.float32) for x in (pose, velocity, size)), tracks.kinds[kept].astype(np.int32), valid)
+
+
+def _nearest_time(there: Bool[np.ndarray, "times"]) -> Int[np.ndarray, "times"]:
+    """For each time, the nearest at which somebody is there: poses stand still before and after, without a jump."""
+    known, times = np.flatnonzero(there), np.arange(len(there))
+    return known[np.argmin(np.abs(times[:, None] - known), axis=1)]
 
 
 def _middle(sizes: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ CLEARANCE = 2.5  # m; bridges leave 4.5 or more, and heights of one road vary by
 SLOPE = 0.08  # m/m, what roads climb at most
 AHEAD = 200.0  # m along the lanes that go on
 SAMPLED = 3.0  # m between two points whose heights are compared
+MOST = 100  # such points between two points of a line
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,7 @@ class Samples:
 def sampled(shapes: Float[np.ndarray, "shapes points 3"]) -> Samples:
     """Points every SAMPLED m along lines, or the sides of areas."""
     a, b = shapes[:, :-1], shapes[:, 1:]
-    pieces = np.maximum(1, np.ceil(np.linalg.norm((b - a)[..., :2], axis=-1) / SAMPLED).astype(int)).reshape(-1)
+    pieces = np.clip(np.ceil(np.linalg.norm((b - a)[..., :2], axis=-1) / SAMPLED), 1, MOST).astype(int).reshape(-1)
     piece = np.repeat(np.arange(len(pieces)), pieces)
     step = np.arange(len(piece)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
     share = (step + 0.5) / pieces[piece]

@@ -1,6 +1,7 @@
 """Files, folders and globs -> a stream of recordings. What a file is, is told by its content, never by its name."""
 
 import glob
+import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,7 +43,7 @@ def files(paths: Iterable[str | Path]) -> list[tuple[Path, bool]]:
     found: dict[Path, bool] = {}
     for path in paths:
         text = str(path)
-        matches = [Path(text)] if Path(text).exists() else [Path(m) for m in sorted(glob.glob(text, recursive=True))]
+        matches = [Path(text)] if os.path.exists(text) else [Path(m) for m in sorted(glob.glob(text, recursive=True))]
         if not matches:
             raise UsageError(f"{text}: {'no file matches' if glob.has_magic(text) else 'there is no such file or folder'}")
         for match in matches:
@@ -165,7 +166,17 @@ def stream(paths: Iterable[str | Path]) -> Iterator[Recording]:
     Raises:
         UsageError: as `files` and `recordings`.
     """
+    for file in recorded(paths):
+        yield from recordings(file)
+
+
+def recorded(paths: Iterable[str | Path]) -> Iterator[Path]:
+    """The files that paths name, without those in folders that are plainly something else.
+
+    Raises:
+        UsageError: as `files` and `kind_of`.
+    """
     for file, asked in files(paths):
         found = kind_of(file)
         if asked or not (isinstance(found, Foreign) and found.certain):
-            yield from recordings(file)
+            yield file

@@ -21,7 +21,8 @@ SIGNAL_STATES = (
     "unknown", "arrow_stop", "arrow_caution", "arrow_go", "stop", "caution", "go", "flashing_stop", "flashing_caution",
 )  # fmt: skip
 MOST_CELLS = 1_000_000  # tracks x times; a file that claims more is no recording of traffic
-MOST_POINTS = 4_000_000  # of a map
+MOST_POINTS = 500_000  # of a map, and as many links between its lanes
+MOST_SIGNALS = 500_000  # states of traffic lights
 
 
 @dataclass(frozen=True)

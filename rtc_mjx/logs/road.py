@@ -13,12 +13,14 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from rtc_mjx.logs.recording import SIGNAL_STATES, Lane, Recording
+from rtc_mjx.logs.recording import SIGNAL_STATES, Lane, Recording, refuse_if
 from rtc_mjx.logs.scene import AMBER, GREEN, NO_SIGNAL, RED
 
 Connectivity = Literal["logged", "derived", "none"]
 MEETS, STRAIGHT, LEVEL = 0.1, np.radians(20.0), 1.0  # m, rad, m: how well a lane has to go on to be taken as connected
 TOLERANCE = 0.05  # m, by which a simplified line may be off
+AT_ONCE = 400  # points of a road edge
+MOST_LANES = 5000  # of a map; those of whole quarters have one or two thousand
 SHORTEST = 0.05  # m, below which a lane is none
 EVERYBODY = 2  # who goes first at a stop sign (`RoadGraph.gives_way`)
 # A flashing red light is a stop sign, a flashing amber one a warning: neither forbids to go for as long as it lasts.
@@ -55,8 +57,13 @@ class Roads:
 
 
 def prepare(recording: Recording, points: int) -> Roads:
-    """The roads of a recording; lanes get that many points."""
-    notes: Counter[str] = Counter()
+    """The roads of a recording; lanes get that many points.
+
+    Raises:
+        UsageError: there are more lanes than any map has.
+    """
+    count, notes = len(recording.map.lanes), Counter[str]()
+    refuse_if(count > MOST_LANES, recording.source, f"its map has {count} lanes; more than {MOST_LANES} are not converted")
     usable, kept = _drivable(recording, notes)
     lines = [_lane_line(line, points, notes) for line in kept]
     index = {lane.id: i for i, lane in enumerate(usable)}
@@ -172,11 +179,14 @@ def derived(lines: list[np.ndarray]) -> tuple[tuple[int, ...], ...]:
     leaving, setting_out = (np.array([np.arctan2(*(b - a)[1::-1]) for a, b in pairs]) for pairs in (
         [(line[-2], line[-1]) for line in lines], [(line[0], line[1]) for line in lines],
     ))  # fmt: skip
-    away = ends[:, None] - starts[None]
-    turn = np.abs((leaving[:, None] - setting_out[None] + np.pi) % (2 * np.pi) - np.pi)
-    meets = (np.linalg.norm(away[..., :2], axis=-1) < MEETS) & (np.abs(away[..., 2]) < LEVEL) & (turn < STRAIGHT)
-    np.fill_diagonal(meets, False)
-    return tuple(tuple(int(j) for j in np.flatnonzero(row)) for row in meets)
+    found = []
+    for i, end in enumerate(ends):  # one row of the table at a time
+        away = starts - end
+        turn = np.abs((setting_out - leaving[i] + np.pi) % (2 * np.pi) - np.pi)
+        meets = (np.linalg.norm(away[:, :2], axis=1) < MEETS) & (np.abs(away[:, 2]) < LEVEL) & (turn < STRAIGHT)
+        meets[i] = False
+        found.append(tuple(int(j) for j in np.flatnonzero(meets)))
+    return tuple(found)
 
 
 def _stop_signs(recording: Recording, index: dict[str, int], notes: Counter[str]) -> np.ndarray:
@@ -209,8 +219,10 @@ def _edges(recording: Recording, notes: Counter[str]) -> np.ndarray:
         if len(line) < 2:
             notes["road edges without a length, dropped"] += 1
             continue
-        line = line[simplified(line[:, :2], len(line))[0]]
-        pieces.append(np.stack([line[:-1], line[1:]], axis=1))
+        for start in range(0, len(line) - 1, AT_ONCE):  # so that the work grows with a line's length and not with its square
+            part = line[start : start + AT_ONCE + 1]
+            part = part[simplified(part[:, :2], len(part))[0]]
+            pieces.append(np.stack([part[:-1], part[1:]], axis=1))
     notes["maps without road edges: nobody can be off the road"] += not pieces
     return np.concatenate(pieces) if pieces else np.zeros((0, 2, 3))
 

@@ -22,7 +22,7 @@ from rtc_mjx import cache
 from rtc_mjx.errors import UsageError
 from rtc_mjx.files import write_bytes_whole
 from rtc_mjx.logs.convert import Conversion, Converted, Options, convert
-from rtc_mjx.logs.read import files, recordings
+from rtc_mjx.logs.read import recorded, recordings
 from rtc_mjx.logs.recording import Recording
 from rtc_mjx.logs.scene import LoggedScene, RoadGraph
 
@@ -50,7 +50,7 @@ def scenes(paths: Iterable[str | Path], options: Options) -> Iterator[Converted]
         UsageError: as `read.stream`; or there is no scene in any of them.
     """
     count = 0
-    for file, _ in files(paths):
+    for file in recorded(paths):
         for conversion in conversions(file, options):
             yield from conversion.scenes
             count += len(conversion.scenes)

@@ -51,8 +51,9 @@ class Arrays:
         """
         held = self.values.get(name.encode())
         refuse_if(held is None, self.source, f"feature {name} is missing")
-        numbers = held.float_list.value or held.int64_list.value  # type: ignore[union-attr]  # refused above
-        flat = np.array(numbers)
+        floats, integers = held.float_list.value, held.int64_list.value  # type: ignore[union-attr]  # refused above
+        with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet one
+            flat = np.array(floats, float) if floats else np.array(integers, np.int64)
         refuse_if(flat.size % columns > 0, self.source, f"feature {name} has {flat.size} numbers, which is no multiple of {columns}")
         return flat.reshape(-1, columns)
 

@@ -12,7 +12,7 @@ from rtc_mjx.errors import UsageError
 from rtc_mjx.logs.recording import refuse_if
 
 HEADER, FOOTER = struct.Struct("<QI"), struct.Struct("<I")
-LARGEST = 32 * 2**20  # bytes of a record; those of the Waymo Open Motion Dataset have one or two million
+LARGEST = 16 * 2**20  # bytes of a record; those of the Waymo Open Motion Dataset have one or two million
 
 
 def masked(data: bytes) -> int:

@@ -10,6 +10,7 @@ from rtc_mjx.errors import UsageError
 from rtc_mjx.logs import messages
 from rtc_mjx.logs.recording import (
     MOST_POINTS,
+    MOST_SIGNALS,
     OTHER,
     SIGNAL_STATES,
     Feature,
@@ -55,7 +56,7 @@ def read(payload: bytes, source: str) -> Recording:
         now=int(scenario.current_time_index),
         tracks=tracks,
         map=read_map(scenario.map_features, source, repairs),
-        signals=_signals(scenario.dynamic_map_states, len(times), repairs),
+        signals=_signals(scenario.dynamic_map_states, len(times), source, repairs),
         sdc=sdc if named else -1,
         to_predict=tuple(wanted),
         of_interest=tuple(str(i) for i in scenario.objects_of_interest),
@@ -95,9 +96,10 @@ def read_map(features: Any, source: str, repairs: Counter[str]) -> Map:
     held: dict[str, list[Any]] = {name: [] for name in ("road_edge", "road_line", "crosswalk", "speed_bump", "driveway")}
     lanes, signs, points = [], [], 0
     for feature in features:
+        points += _count(feature)
+        refuse_if(points > MOST_POINTS, source, f"its map has more than {MOST_POINTS} points and links")
         if feature.HasField("lane"):
             lanes.append(_lane(str(feature.id), feature.lane))
-            points += len(lanes[-1].line)
         elif feature.HasField("stop_sign"):
             sign = feature.stop_sign
             signs.append(StopSign(str(feature.id), _points([sign.position])[0], tuple(str(i) for i in sign.lane)))
@@ -108,13 +110,19 @@ def read_map(features: Any, source: str, repairs: Counter[str]) -> Map:
                 continue
             shape = getattr(feature, name)
             held[name].append(Feature(str(feature.id), _points(shape.polyline if name.startswith("road") else shape.polygon)))
-            points += len(held[name][-1].points)
-        refuse_if(points > MOST_POINTS, source, f"its map has more than {MOST_POINTS} points")
     return Map(
         lanes=tuple(lanes), connected=True, road_edges=tuple(held["road_edge"]), road_lines=tuple(held["road_line"]),
         crosswalks=tuple(held["crosswalk"]), speed_bumps=tuple(held["speed_bump"]), driveways=tuple(held["driveway"]),
         stop_signs=tuple(signs),
     )  # fmt: skip
+
+
+def _count(feature: Any) -> int:
+    """Points and links of a map feature, before they are taken out of the message."""
+    lane = feature.lane
+    links = (lane.entry_lanes, lane.exit_lanes, lane.left_neighbors, lane.right_neighbors, feature.stop_sign.lane)
+    areas = (feature.crosswalk.polygon, feature.speed_bump.polygon, feature.driveway.polygon)
+    return sum(map(len, (lane.polyline, feature.road_line.polyline, feature.road_edge.polyline, *links, *areas)))
 
 
 def _lane(name: str, lane: Any) -> Lane:
@@ -129,7 +137,9 @@ def _points(points: Any) -> np.ndarray:
     return np.array([(p.x, p.y, p.z) for p in points], float).reshape(-1, 3)
 
 
-def _signals(states: Any, times: int, repairs: Counter[str]) -> Signals:
+def _signals(states: Any, times: int, source: str, repairs: Counter[str]) -> Signals:
+    count = sum(len(at.lane_states) for at in states)
+    refuse_if(count > MOST_SIGNALS, source, f"it claims {count} states of traffic lights; more than {MOST_SIGNALS} are not read")
     told = [(i, s) for i, at in enumerate(states) for s in at.lane_states]
     kept = [(i, s) for i, s in told if i < times and 0 <= s.state < len(SIGNAL_STATES)]
     repairs["signal states of an unknown kind or time, dropped"] += len(told) - len(kept)
