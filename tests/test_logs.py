@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from rtc_mjx.errors import UsageError
-from rtc_mjx.logs import AMBER, GREEN, NO_SIGNAL, RED, read, store
+from rtc_mjx.logs import AMBER, GREEN, NO_SIGNAL, RED, pickled, read, store
 from rtc_mjx.logs.convert import Options, convert
 from rtc_mjx.logs.levels import level_of, sampled
 from rtc_mjx.logs.recording import Recording
@@ -190,6 +190,13 @@ def test_other_rates_are_resampled_and_too_short_or_coarse_logs_refused(tmp_path
             convert(dataclasses.replace(recording, times=times), SMALL)
     with pytest.raises(UsageError, match="from 4 s on"):
         convert(recording, dataclasses.replace(SMALL, start=4.0))
+
+
+def test_headings_between_two_times_take_the_shorter_way_round(tmp_path):
+    recording = dataclasses.replace(made("womd_scenario", tmp_path), times=np.arange(91) / 8)
+    recording.tracks.pose[0, :, 3] = np.where(np.arange(91) % 2, 3.1, -3.1)
+    heading = convert(recording, SMALL).scenes[0].scene.pose[0, :, 2]
+    assert np.all(np.abs(np.cos(heading)) > 0.99)
 
 
 def test_a_later_start_is_a_later_scene(tmp_path):
@@ -443,6 +450,19 @@ def test_malicious_pickles_run_nothing_and_stay_small(tmp_path):
     done = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True, cwd=ROOT, check=False, timeout=60)
     assert done.returncode == 0 and int(done.stdout) > 15, done.stderr
     assert not (tmp_path / "flag").exists()
+
+
+@pytest.mark.parametrize(
+    ("data", "what"),
+    [
+        (b"\x80\x04cos\nsystem\n.", "os.system"), (b"\x80\x04cnumpy\nndarray\n)R.", "a call of numpy ndarray"),
+        (b"\x80\x04]N}b.", "state of a NoneType"), (b"\x80\x04cbuiltins\nint\nN\x85R.", "a call of builtins int"),
+        (b"\x80\x04cnumpy\ndtype\n\x8c\x0350i\x85R.", "arrays of type '50i'"), (b"\x80\x04u.", "operations without a mark"),
+    ],
+)  # fmt: skip
+def test_a_pickle_says_what_it_wanted(data, what):
+    with pytest.raises(UsageError, match=f"made: its pickle holds {what}"):
+        pickled.load(data, "made")
 
 
 def test_a_name_that_runs_code_would_be_noticed(tmp_path):

@@ -122,10 +122,10 @@ class Machine:
     def since_mark(self) -> list[Any]:
         """Takes everything off the stack down to the mark."""
         at = len(self.stack) - 1
-        while self.stack[at] is not MARK:
+        while at >= 0 and self.stack[at] is not MARK:
             at -= 1
-            if at < 0:
-                raise Refused("operations without a mark")
+        if at < 0:
+            raise Refused("operations without a mark")
         taken = self.stack[at + 1 :]
         del self.stack[at:]
         return taken

@@ -20,6 +20,7 @@ LaneKind = Literal["freeway", "surface_street", "bike_lane", "unknown"]
 SIGNAL_STATES = (
     "unknown", "arrow_stop", "arrow_caution", "arrow_go", "stop", "caution", "go", "flashing_stop", "flashing_caution",
 )  # fmt: skip
+MPH = 0.44704  # m/s
 MOST_CELLS = 1_000_000  # tracks x times; a file that claims more is no recording of traffic
 MOST_POINTS = 500_000  # of a map, and as many links between its lanes
 MOST_SIGNALS = 500_000  # states of traffic lights

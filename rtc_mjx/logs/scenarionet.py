@@ -12,6 +12,7 @@ from rtc_mjx.logs import pickled
 from rtc_mjx.logs.plain import dictionary, flat, name, names, number, rows, whole
 from rtc_mjx.logs.recording import (
     MOST_POINTS,
+    MPH,
     OTHER,
     SIGNAL_STATES,
     Feature,
@@ -35,7 +36,6 @@ LANES: dict[str, LaneKind] = {
 }  # fmt: skip
 AREAS = {"CROSSWALK": "crosswalks", "CROSS_WALK": "crosswalks", "SPEED_BUMP": "speed_bumps", "DRIVEWAY": "driveways"}
 KMH = 1 / 3.6  # m/s
-MPH = 0.44704  # m/s
 
 
 def read(data: bytes, source: str) -> Recording:

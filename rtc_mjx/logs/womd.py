@@ -11,6 +11,7 @@ from rtc_mjx.logs import messages
 from rtc_mjx.logs.recording import (
     MOST_POINTS,
     MOST_SIGNALS,
+    MPH,
     OTHER,
     SIGNAL_STATES,
     Feature,
@@ -25,7 +26,6 @@ from rtc_mjx.logs.recording import (
     refuse_if,
 )
 
-MPH = 0.44704  # m/s
 LANE_KINDS: tuple[LaneKind, ...] = ("unknown", "freeway", "surface_street", "bike_lane")
 
 
