@@ -19,6 +19,7 @@ from rtc_mjx import cache
 from rtc_mjx.errors import UsageError
 from rtc_mjx.keys import stream
 from rtc_mjx.models import Statistics
+from rtc_mjx.pytree import in_parts
 from rtc_mjx.rollout import rollout
 from rtc_mjx.scenes import Scene
 from rtc_mjx.trajectory import Demonstration, Episode
@@ -37,7 +38,12 @@ def demonstrate(scene: Scene, key: jax.Array, change: Callable[[Episode], Episod
     episode = change(scene.reset(outside))
     if episode is None:
         raise UsageError(f"scene {scene.name} has nothing to change")
-    actor, truth = scene.expert(inside, episode)
+    return driven(scene, episode, inside)
+
+
+def driven(scene: Scene, episode: Episode, key: jax.Array) -> Demonstration:
+    """An episode driven by an expert."""
+    actor, truth = scene.expert(key, episode)
     return Demonstration(episode, rollout(scene, actor, episode), truth)
 
 
@@ -46,9 +52,12 @@ def demonstrations(scene: Scene, count: int, seed: int) -> Demonstration:
 
     Args:
         scene: the scene and its settings.
-        count: how many.
-        seed: demonstrations of different seeds are independent.
+        count: how many; of recorded scenes all, if there are fewer.
+        seed: demonstrations of different seeds are independent. Recordings have two parts: TEST is one of them, all else the other.
     """
+    episodes = scene.recorded("test" if seed == TEST else "train", count)
+    if episodes is not None:
+        return _replayed(scene, episodes)
     make = jax.jit(jax.vmap(lambda key: demonstrate(scene, key)))
     shapes = jax.eval_shape(make, jax.random.split(stream("demonstrations", seed), count))
     file = cache.folder() / "demonstrations" / f"{scene.name}-{fingerprint(scene, count, seed)}.npz"
@@ -59,18 +68,27 @@ def demonstrations(scene: Scene, count: int, seed: int) -> Demonstration:
     return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
 
 
+def _replayed(scene: Scene, episodes: Episode) -> Demonstration:
+    """Recorded episodes driven by their logged experts, as numpy arrays."""
+    run = jax.jit(jax.vmap(lambda episode: driven(scene, episode, jax.random.key(0))))  # a logged expert draws nothing
+    return in_parts(run, episodes, CHUNK)
+
+
 def by_others(scene: Scene, count: int, seed: int, minds: int) -> Demonstration:
-    """The episodes of a seed, each driven by as many other experts: what else might have been done in them; leading axes (count, minds)."""
+    """The episodes of a seed, each driven by as many other experts: what else might have been done in them; leading axes (count, minds).
+
+    Raises:
+        UsageError: the scene's episodes have one expert each.
+    """
 
     def again(key: jax.Array) -> Demonstration:
         outside, inside = jax.random.split(key)
         episode = scene.reset(outside)
 
-        def one(mind: jax.Array) -> Demonstration:
-            actor, truth = scene.expert(jax.random.fold_in(inside, mind), episode)
-            return Demonstration(episode, rollout(scene, actor, episode), truth)
+        return jax.vmap(lambda mind: driven(scene, episode, jax.random.fold_in(inside, mind)))(1 + jnp.arange(minds))
 
-        return jax.vmap(one)(1 + jnp.arange(minds))
+    if not scene.redrivable:
+        raise UsageError(f"scene {scene.name}: recorded episodes have one expert each")
 
     return _made(jax.jit(jax.vmap(again)), count, seed, max(1, CHUNK // minds))
 
@@ -85,10 +103,8 @@ def redriven(scene: Scene, count: int, seed: int, change: Callable[[Episode], Ep
 
 
 def _made(make: Callable[[jax.Array], Demonstration], count: int, seed: int, at_once: int) -> Demonstration:
-    """What a function makes of the keys of a seed's episodes, as numpy arrays; so many at once as memory allows."""
-    keys = jax.random.split(stream("demonstrations", seed), count)
-    parts = [jax.device_get(make(keys[i : i + at_once])) for i in range(0, count, at_once)]
-    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    """What a function makes of the keys of a seed's episodes, as numpy arrays."""
+    return in_parts(make, jax.random.split(stream("demonstrations", seed), count), at_once)
 
 
 def fingerprint(scene: Scene, count: int, seed: int) -> str:

@@ -31,6 +31,7 @@ from rtc_mjx.keys import stream
 from rtc_mjx.learner import Learner, start_shapes
 from rtc_mjx.methods import Method
 from rtc_mjx.models import Networks
+from rtc_mjx.pytree import in_parts
 from rtc_mjx.runs import Run
 from rtc_mjx.scenes import Scene
 from rtc_mjx.trajectory import Demonstration, Trajectory
@@ -70,23 +71,17 @@ def roller(learner: Learner, samples: int, watch: Watch = iter) -> Roll:
         return {name: learner.scene.features(mine, track) | {FINITE: _finite(track)} for name, track in tracks.items()}
 
     @jax.jit
-    def several(networks: Networks, test: Demonstration, given: Donors, keys: Array) -> dict[str, dict[str, Array]]:
-        of_episode = jax.vmap(functools.partial(one, networks), in_axes=(None, None, 0))
-        return jax.vmap(of_episode, out_axes=1)(test, given, keys)
+    def several(networks: Networks, held: tuple[Demonstration, Donors, Array]) -> dict[str, dict[str, Array]]:
+        return jax.vmap(jax.vmap(functools.partial(one, networks), in_axes=(None, None, 0)))(*held)
 
     def roll(networks: Networks, test: Demonstration, given: Donors, key: Array) -> dict[str, Features]:
         count, seeds = (jax.tree.leaves(x)[0].shape[0] for x in (test, networks))
         keys = jax.vmap(lambda episode: random.split(random.fold_in(key, episode), samples))(jnp.arange(count))
-        at_once = part_size(count, samples)
-        parts = []
-        for seed, first in watch([(seed, first) for seed in range(seeds) for first in range(0, count, at_once)]):
-            rows = np.arange(first, first + at_once) % count  # one shape, one program; what is there twice is cut off
-            mine = jax.tree.map(lambda x, rows=rows: x[rows], (test, given, keys))
-            found = jax.device_get(several(jax.tree.map(lambda x, i=seed: x[i], networks), *mine))
-            parts.append(jax.tree.map(lambda x, left=count - first: x[:, :left], found))
-        each = len(parts) // seeds
-        of_seeds = [jax.tree.map(lambda *x: np.concatenate(x, axis=1), *parts[i : i + each]) for i in range(0, len(parts), each)]
-        return jax.tree.map(lambda *x: np.stack(x), *of_seeds)
+        of_seeds = []
+        for seed in range(seeds):
+            mine = functools.partial(several, jax.tree.map(lambda x, i=seed: x[i], networks))
+            of_seeds.append(in_parts(mine, (test, given, keys), part_size(count, samples), watch))
+        return jax.tree.map(lambda *x: np.stack(x).swapaxes(1, 2), *of_seeds)
 
     return roll
 
@@ -137,7 +132,7 @@ def evaluate(run: Run, episodes: int, watch: Watch = iter) -> dict[str, Any]:
         "scene": config.scene.name,
         "method": config.method,
         "seeds": config.seeds,
-        "episodes": episodes,
+        "episodes": len(next(iter(expert.values()))),
         "update": update,
         "metrics": means["prior"],
         "types": means,

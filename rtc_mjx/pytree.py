@@ -1,10 +1,11 @@
-"""What crosses `jit`: frozen dataclasses that JAX sees as trees of their fields."""
+"""What crosses `jit`: frozen dataclasses that JAX sees as trees of their fields; and functions of long trees, part by part."""
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
+import numpy as np
 
 T = TypeVar("T")
 
@@ -30,3 +31,23 @@ def pytree(cls: type[T]) -> type[T]:
 
     jax.tree_util.register_pytree_with_keys(frozen, flatten, unflatten)
     return frozen
+
+
+def in_parts(function: Callable[[Any], Any], tree: Any, at_once: int, watch: Callable[[Sequence[Any]], Iterable[Any]] = iter) -> Any:
+    """A compiled function of a tree's leading axis, as numpy arrays: so many rows at once as memory allows.
+
+    All parts are of one shape, so that one program does; rows that fill up the last part are cut off again.
+
+    Args:
+        function: keeps the leading axis.
+        tree: arrays with equal leading axes.
+        at_once: rows of a part.
+        watch: goes through the parts, such as a progress bar.
+    """
+    count = jax.tree.leaves(tree)[0].shape[0]
+    at_once, parts = min(count, at_once), []
+    for first in watch(range(0, count, at_once)):
+        rows = np.arange(first, first + at_once) % count
+        found = jax.device_get(function(jax.tree.map(lambda x, rows=rows: x[rows], tree)))
+        parts.append(jax.tree.map(lambda x, left=count - first: x[:left], found))
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)

@@ -61,9 +61,10 @@ def entries(scene: str, methods: Sequence[str], ablate: bool, options: Sequence[
     return held
 
 
-def on_scene(scene: str) -> list[str]:
-    """The methods that can run on a scene."""
-    return [name for name, method in METHODS.items() if method.kind != "label" or scene_type(scene)().labels]
+def on_scene(scene: str, options: Sequence[str]) -> list[str]:
+    """The methods that can run on a scene with these options."""
+    held = config.from_command_line(["--scene", scene, "--method", "bc", *options], "python -m rtc_mjx.study").scene
+    return [name for name, method in METHODS.items() if method.kind != "label" or held.labels]
 
 
 def complete(entry: Entry, scene: str, folder: Path) -> Run:
@@ -120,7 +121,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--runs", type=Path, metavar="DIR", help="where the runs are kept (default: runs/study)")
     options, rest = parser.parse_known_args(argv)
     scene_type(options.scene)
-    chosen = [method_name(name) for name in options.methods.split(",")] if options.methods else on_scene(options.scene)
+    chosen = [method_name(name) for name in options.methods.split(",")] if options.methods else on_scene(options.scene, rest)
     cache.keep_compiled()
     folder, out = (options.runs or Path("runs/study")) / options.scene, options.results / options.scene
     wanted = entries(options.scene, chosen, options.ablations, ["--seeds", str(options.seeds), *rest])

@@ -87,8 +87,9 @@ def analyse(run: Run, episodes: int, experts: int) -> dict[str, Any]:
         "seeds": setup.config.seeds,
         "episodes": episodes,
         "update": setup.update,
-        "realism": realism(setup, min(episodes, REALISM_EPISODES), experts),
     }
+    if setup.config.scene.redrivable:
+        out["realism"] = realism(setup, min(episodes, REALISM_EPISODES), experts)
     if not setup.learner.method.encodes:
         return out
     types, information_bits = shift(setup), told_by_types(setup)
@@ -98,8 +99,10 @@ def analyse(run: Run, episodes: int, experts: int) -> dict[str, Any]:
 def shift(setup: Setup) -> dict[str, dict[str, list[float]]]:
     """The scene's metrics per source of types, a list over seeds: 'prior', 'paired', 'same_xi', 'shuffled'."""
     scene, test = setup.config.scene, setup.test
-    others = dataset.by_others(scene, len(jax.tree.leaves(test)[0]), dataset.TEST, 1)
-    given = evaluate.donors(setup.learner.method, test) | {"same_xi": jax.tree.map(lambda x: x[:, 0], others.trajectory)}
+    given = evaluate.donors(setup.learner.method, test)
+    if scene.redrivable:
+        others = dataset.by_others(scene, len(jax.tree.leaves(test)[0]), dataset.TEST, 1)
+        given["same_xi"] = jax.tree.map(lambda x: x[:, 0], others.trajectory)
     features = evaluate.roller(setup.learner, scene.samples)(setup.networks, test, given, stream("type shift", 0))
     return evaluate.score(setup.config, features, evaluate.expert_features(scene, test))
 
@@ -118,10 +121,12 @@ def inferred(setup: Setup) -> np.ndarray:
 def told_by_types(setup: Setup) -> dict[str, dict[str, Any]]:
     """Bits that types tell of xi, which they should not, and of the expert's mind, which they should; with the null of each."""
     luck = np.asarray(jax.jit(jax.vmap(setup.config.scene.luck))(setup.test.episode))
-    mind = np.stack([np.asarray(x, float) for x in jax.tree.leaves(setup.truth)], axis=1)
+    told = {"xi": luck}
+    if jax.tree.leaves(setup.truth):  # nobody knows what logged drivers had in mind
+        told["mind"] = np.stack([np.asarray(x, float) for x in jax.tree.leaves(setup.truth)], axis=1)
     types = inferred(setup)
     out = {}
-    for name, of in (("xi", luck), ("mind", mind)):
+    for name, of in told.items():
         found = [information(g, of) for g in types]
         null = np.concatenate([values for _, values in found])
         out[name] = {"bits": [bits for bits, _ in found], "null_mean": float(np.mean(null)), "null_95": float(np.percentile(null, 95))}
@@ -209,6 +214,8 @@ def tables(result: dict[str, Any]) -> list[Table]:
         for name, bits in result["reencoding"].items():
             third.add_row(name.replace("_", " "), _spread(bits))
         out += [first, second, third]
+    if "realism" not in result:
+        return out
     last = Table("feature", "agent", "floor", title="conditional realism: JSD of p(tau|xi) from the experts', bits")
     for name, values in result["realism"]["features"].items():
         last.add_row(name, _spread(values["agent"]), f"{values['floor']:.4f}")
@@ -230,7 +237,7 @@ def figure(result: dict[str, Any], metric: str, file: Path) -> None:
     panels = [
         (result["types"], lambda held: held[metric], metric.replace("_", " ")) if "types" in result else None,
         (result["information"], lambda held: held["bits"], "types tell of, bits") if "information" in result else None,
-        (result["realism"]["features"], lambda held: held["agent"], "conditional realism: JSD, bits"),
+        (result["realism"]["features"], lambda held: held["agent"], "conditional realism: JSD, bits") if "realism" in result else None,
     ]
     for axis, panel in zip(axes, panels, strict=True):
         if panel is None:

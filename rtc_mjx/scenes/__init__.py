@@ -5,9 +5,16 @@ from rtc_mjx.scenes.base import Actor, ItemSet, Scene, split_items
 from rtc_mjx.scenes.double_goal import DoubleGoal
 from rtc_mjx.scenes.intersection import Intersection
 from rtc_mjx.scenes.merge import Merge
+from rtc_mjx.scenes.recorded import Recorded
 from rtc_mjx.scenes.roundabout import Roundabout
 
-SCENES: dict[str, type[Scene]] = {"double_goal": DoubleGoal, "intersection": Intersection, "roundabout": Roundabout, "merge": Merge}
+SCENES: dict[str, type[Scene]] = {
+    "double_goal": DoubleGoal,
+    "intersection": Intersection,
+    "roundabout": Roundabout,
+    "merge": Merge,
+    "womd": Recorded,
+}
 
 
 def scene_type(name: str) -> type[Scene]:
@@ -21,4 +28,6 @@ def scene_type(name: str) -> type[Scene]:
     return SCENES[name]
 
 
-__all__ = ["SCENES", "Actor", "DoubleGoal", "Intersection", "ItemSet", "Merge", "Roundabout", "Scene", "scene_type", "split_items"]
+__all__ = [
+    "SCENES", "Actor", "DoubleGoal", "Intersection", "ItemSet", "Merge", "Recorded", "Roundabout", "Scene", "scene_type", "split_items",
+]  # fmt: skip

@@ -8,7 +8,7 @@ import abc
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -78,6 +78,7 @@ class Scene(abc.ABC):
     samples: ClassVar[int] = 1  # rollouts of each test episode, every one with a type of its own
     mark_size: ClassVar[float] = 0.018  # m, radius of the marks that trails are made of in videos
     side_by_side: ClassVar[bool] = False  # whether a video shows each rollout in a picture of its own
+    redrivable: ClassVar[bool] = True  # whether other experts can drive an episode, and the same ones once more
     described_by: ClassVar[tuple[str, ...]] = ()  # features by which trajectories of one episode are compared
     reconstructs_rollouts: ClassVar[bool] = False  # whether L_rec compares rollouts (`discrepancy`) rather than actions
     steps: int = field(default=60)
@@ -134,6 +135,10 @@ class Scene(abc.ABC):
     def paint(self, model: mujoco.MjModel, episode: Episode, time: int) -> None:
         """Makes a dressed model look as it does at a control step of an episode; as it is unless a scene says so."""
         return
+
+    def recorded(self, part: Literal["train", "test"], count: int) -> Episode | None:
+        """So many of the recorded episodes of a part (all, if there are fewer), with a leading axis; None where episodes are drawn."""
+        return None
 
     @abc.abstractmethod
     def reset(self, key: jax.Array) -> Episode:

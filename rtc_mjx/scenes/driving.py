@@ -133,7 +133,7 @@ class Driving(Scene):
         place = jnp.where(road.present[times][..., None], place / FAR, 0.0)
         return jnp.concatenate([jnp.ravel(lights == RED), jnp.ravel(lights == GREEN), jnp.ravel(place), jnp.ravel(road.present[times])])
 
-    def flipped(self, episode: Episode) -> Episode:
+    def flipped(self, episode: Episode) -> Episode | None:
         """Red lights are green, green and amber ones are red."""
 
         def turned(signals: Array) -> Array:
