@@ -93,7 +93,7 @@ class Reporter:
             TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.fields[shown]}"),
             console=self.console, disable=not self.console.is_terminal, transient=True,
         )  # fmt: skip
-        self.task, self.total, self.done = self.bar.add_task("reading", total=total, shown=""), total, 0
+        self.task = self.bar.add_task("reading", total=total, shown="")
 
     def recording(self, file: Path, summary: Summary) -> None:
         """One more recording of a file is done."""
@@ -104,16 +104,13 @@ class Reporter:
 
     def file(self, lines: Sequence[str]) -> None:
         """A file is done."""
-        self.done += 1
-        self.bar.update(self.task, completed=self.done)
-        self.say("\n".join(lines), sys.stdout)
+        self.bar.advance(self.task)
+        print("\n".join(lines), flush=True)
 
-    def say(self, text: str, where: object) -> None:
-        """Writes above the bar."""
-        if self.console.is_terminal and where is sys.stderr:
-            self.bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
-        else:
-            print(text, file=where, flush=True)  # type: ignore[call-overload]  # a text stream
+    def bad(self, error: UsageError) -> None:
+        """A file among others cannot be read."""
+        self.bar.advance(self.task)
+        self.console.print(str(error), markup=False, highlight=False, soft_wrap=True)
 
 
 class Painter:
@@ -183,13 +180,13 @@ def main(argv: Sequence[str] | None = None) -> None:
             except UsageError as error:
                 bad.append(error)
                 if len(found) > 1:
-                    reporter.say(str(error), sys.stderr)
+                    reporter.bad(error)
                 continue
             kinds[str(kind)] += 1
             total.join(summary)
             reporter.file([f"{file}", *summary.lines(str(kind))])
     if kinds:
-        Console(width=None if sys.stdout.isatty() else 130).print(_table(kinds, total))
+        Console().print(_table(kinds, total))
     _finish(bad, kinds, len(found), total.counts["scenes"] if asked.convert else 1)
 
 
@@ -211,11 +208,13 @@ def _finish(bad: Sequence[UsageError], kinds: Counter[str], count: int, scenes: 
 
 
 def _table(kinds: Counter[str], total: Summary) -> Table:
-    out = Table(title="all files", title_justify="left")
-    names = ["recordings", "scenes", *KINDS[1:], "lanes", "signal states"]
-    for name in ("files", *names):
-        out.add_column(name, justify="right" if name != "files" else "left")
-    out.add_row(", ".join(f"{n} {kind}" for kind, n in kinds.items()), *(f"{total.counts[name]:,}" for name in names))
+    out = Table(title="all files", title_justify="left", show_header=False)
+    out.add_column(justify="right")
+    out.add_column()
+    for kind, count in kinds.items():
+        out.add_row(f"{count:,}", f"files: {kind}")
+    for name in ("recordings", "scenes", *KINDS[1:], "lanes", "signal states"):
+        out.add_row(f"{total.counts[name]:,}", name)
     return out
 
 
