@@ -32,7 +32,7 @@ class Foreign:
 
 
 def files(paths: Iterable[str | Path]) -> list[tuple[Path, bool]]:
-    """The files that paths name, each once, and whether somebody asked for just that file: not so for those found in folders.
+    """The files that paths name, each once, and whether somebody asked for just that file: not so for those that a folder or glob led to.
 
     Args:
         paths: files, folders (searched to the bottom, hidden files left out) or globs.
@@ -48,7 +48,7 @@ def files(paths: Iterable[str | Path]) -> list[tuple[Path, bool]]:
             raise UsageError(f"{text}: {'no file matches' if glob.has_magic(text) else 'there is no such file or folder'}")
         for match in matches:
             if not match.is_dir():
-                found[match] = True
+                found[match] = os.path.exists(text) or found.get(match, False)
                 continue
             inside = [f for f in sorted(match.rglob("*")) if f.is_file() and not _hidden(f.relative_to(match))]
             if not inside:

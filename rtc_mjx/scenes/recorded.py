@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import hashlib
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -183,19 +184,24 @@ def fitted(scene: Recorded, logs: LoggedScene) -> Fit:
 
 @functools.lru_cache(maxsize=8)
 def _pool(scene: Recorded, part: Part) -> Pool:
-    with jax.ensure_compile_time_eval():  # it may be asked for while another function is traced
-        chosen = part_of(scene.converted, part, scene.train_share)
-        if not chosen:
-            raise UsageError(f"{scene.data}: of {len(scene.converted)} scenes none is left to {part}; give more recordings")
-        logs = jax.tree.map(lambda *x: np.stack(x), *(held.scene for held in chosen))
-        fit = fitted(scene, logs)
-        error = np.mean(fit.position_error, axis=1)
-        follows = error <= FOLLOWED
-        left_out = {held.name: float(e) for held, e, good in zip(chosen, error, follows, strict=True) if not good}
-        if not np.any(follows):
-            raise UsageError(f"{scene.data}: no car can follow any of the {len(chosen)} agents to {part}")
-        names = tuple(held.name for held, good in zip(chosen, follows, strict=True) if good)
-        return Pool(jax.tree.map(lambda x: x[follows], logs), np.asarray(fit.actions[follows]), names, left_out)
+    """It may be asked for while a function is traced; in a thread of its own nothing is, and what is computed has values."""
+    with ThreadPoolExecutor(1) as outside:
+        return outside.submit(_gathered, scene, part).result()
+
+
+def _gathered(scene: Recorded, part: Part) -> Pool:
+    chosen = part_of(scene.converted, part, scene.train_share)
+    if not chosen:
+        raise UsageError(f"{scene.data}: of {len(scene.converted)} scenes none is left to {part}; give more recordings")
+    logs = jax.tree.map(lambda *x: np.stack(x), *(held.scene for held in chosen))
+    fit = fitted(scene, logs)
+    error = np.mean(fit.position_error, axis=1)
+    follows = error <= FOLLOWED
+    left_out = {held.name: float(e) for held, e, good in zip(chosen, error, follows, strict=True) if not good}
+    if not np.any(follows):
+        raise UsageError(f"{scene.data}: no car can follow any of the {len(chosen)} agents to {part}")
+    names = tuple(held.name for held, good in zip(chosen, follows, strict=True) if good)
+    return Pool(jax.tree.map(lambda x: x[follows], logs), np.asarray(fit.actions[follows]), names, left_out)
 
 
 def part_of(converted: Sequence[Converted], part: Part, share: float) -> list[Converted]:
