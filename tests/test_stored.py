@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from jax import lax
 from jax.ad_checkpoint import checkpoint_name
-from worlds import WORLDS, draw, make
+from worlds import draw, make
 
 from rtc_mjx import cache
 from rtc_mjx.physics import fast, load, specialised_step
@@ -33,7 +33,13 @@ def everything(x, y):
     """Every kind of node: types, constants told apart by their bits, what is held and what is saved, unused and repeated inputs."""
     held, saved = lax.stop_gradient(jnp.sin(x)), checkpoint_name(x * x, "square")
     odd = jnp.array([-0.0, jnp.nan, jnp.inf])
-    return {"a": held * saved + odd, "b": [x > 0, jnp.round(x).astype(int) + 3, jnp.zeros((0, 2)), y[:1]], "c": x, "d": x[1], "e": jnp.eye(2)}
+    return {
+        "a": held * saved + odd,
+        "b": [x > 0, jnp.floor(x).astype(int) + 3, jnp.zeros((0, 2)), y[:1]],
+        "c": x,
+        "d": x[1],
+        "e": jnp.eye(2),
+    }
 
 
 @pytest.mark.parametrize("wide", [True, False])
@@ -46,7 +52,7 @@ def test_a_program_read_back_is_the_same_bit_for_bit(wide):
         assert_same(both_ways(made, x, jnp.ones(4)), both_ways(read, x, jnp.ones(4)))
 
 
-@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize("name", ["double_goal", "three_cars"])
 def test_stored_programs_of_a_world_are_stored_the_same_again(name, folder):
     world = make(name)
     specialised_step(world)
@@ -60,16 +66,14 @@ def test_stored_programs_of_a_world_are_stored_the_same_again(name, folder):
 def test_a_step_read_back_has_the_values_and_gradients_of_the_folded_one(monkeypatch):
     world = make("car_2")
     arguments = jax.tree.map(lambda x: x.astype(jnp.float32), draw(world, 8, seed=3).arguments(world))
-    monkeypatch.setattr(fast, "kept", lambda _, fold: fold())
-    folded = both_ways(jax.vmap(specialised_step(world)), *arguments)
-    monkeypatch.undo()
-    read = []
-    for _ in range(2):  # written, then read
-        fast._specialised_step.cache_clear()
-        read.append(both_ways(jax.vmap(specialised_step(world)), *arguments))
-        monkeypatch.setattr(fast, "_folded", lambda *_: pytest.fail("folded again"))
-    assert_same(folded, read[0])
-    assert_same(folded, read[1])
+    with monkeypatch.context() as patch:
+        patch.setattr(fast, "kept", lambda _, fold: fold())
+        folded = both_ways(jax.vmap(specialised_step(world)), *arguments)
+    fast._specialised_step.cache_clear()
+    specialised_step(world)  # writes
+    fast._specialised_step.cache_clear()
+    monkeypatch.setattr(fast, "_folded", lambda *_: pytest.fail("folded again"))
+    assert_same(folded, both_ways(jax.vmap(specialised_step(world)), *arguments))
 
 
 def both_ways(function, *inputs):
@@ -124,6 +128,11 @@ def test_a_program_that_binds_natively_is_not_stored(folder):
         made = kept("entry", lambda: {"sorted": (next(times), specialise(jnp.sort, jnp.ones(3)).program)[1]})
         assert np.array_equal(made["sorted"](jnp.array([2.0, 1.0, 3.0]))[0], [1.0, 2.0, 3.0])
     assert next(times) == 2 and not folder.exists()
+
+
+def test_a_program_that_binds_natively_is_refused_as_arrays():
+    with pytest.raises(ValueError, match="natively"):
+        to_arrays(specialise(jnp.sort, jnp.ones(3)).program)
 
 
 def test_without_a_place_to_write_programs_are_made_and_it_is_said(tmp_path, monkeypatch, caplog):

@@ -55,8 +55,14 @@ def _unpacked(arrays: Arrays) -> dict[str, Program]:
 
 
 def to_arrays(program: Program) -> Arrays:
-    """A program without native operations as arrays; only what its outputs need, in the same order."""
+    """A program as arrays; only what its outputs need, in the same order.
+
+    Raises:
+        ValueError: it binds operations natively; a function cannot be stored.
+    """
     graph = program.graph
+    if graph.natives:
+        raise ValueError(f"{len(graph.natives)} operations are bound natively")
     nodes = sorted({*program.input_nodes, *graph.live(program.output_nodes)})
     number = {node: i for i, node in enumerate(nodes)}
     names, dtypes = sorted({graph.ops[n] for n in nodes}), sorted({graph.dtypes[n].name for n in nodes})
