@@ -35,7 +35,7 @@ def everything(x, y):
     odd = jnp.array([-0.0, jnp.nan, jnp.inf])
     return {
         "a": held * saved + odd,
-        "b": [x > 0, jnp.floor(x).astype(int) + 3, jnp.zeros((0, 2)), y[:1]],
+        "b": [x > 0, whole + 3, jnp.zeros((0, 2)), y[:1]],
         "c": x,
         "d": x[1],
         "e": jnp.eye(2),
