@@ -55,7 +55,7 @@ class Kernel:
         remembering where it has been, which is exponential in shared sub-expressions; it does not start if all are used.
         """
         source, target, dtypes = self._slots()
-        shape, given = np.shape(arrays[0]) if arrays else (), dict(zip(self.taken, arrays, strict=True))
+        shape, given = np.shape(arrays[0]), dict(zip(self.taken, arrays, strict=True))  # what takes nothing would be constant
         zeros = [np.zeros((), dtype) for dtype in dtypes]
         doubled = [jnp.broadcast_to(zero if n is None else given[n], (2, *shape)) for n, zero in zip(source, zeros, strict=True)]
         tags = lax.broadcasted_iota(np.int32, (2, *shape), 0)  # not an array of constants: LLVM must see through them
@@ -87,8 +87,7 @@ class Kernel:
 
 
 def _types(*arrays: Any, kernel: Kernel) -> list[jax.core.ShapedArray]:
-    shape = arrays[0].shape if arrays else ()
-    return [jax.core.ShapedArray(shape, kernel.graph.dtypes[n]) for n in kernel.needed]
+    return [jax.core.ShapedArray(arrays[0].shape, kernel.graph.dtypes[n]) for n in kernel.needed]
 
 
 def _over_batch(arrays: Sequence[Any], axes: Sequence[int | None], *, kernel: Kernel) -> tuple[list[jax.Array], list[int]]:
