@@ -1,14 +1,8 @@
 """Demonstrations: experts let loose in a scene, once, and kept on disk under a hash of everything that made them."""
 
 import dataclasses
-import hashlib
 import inspect
-import json
-import logging
-import os
-import tempfile
 from collections.abc import Callable
-from importlib import metadata
 from pathlib import Path
 
 import jax
@@ -61,10 +55,10 @@ def demonstrations(scene: Scene, count: int, seed: int) -> Demonstration:
     make = jax.jit(jax.vmap(lambda key: demonstrate(scene, key)))
     shapes = jax.eval_shape(make, jax.random.split(stream("demonstrations", seed), count))
     file = cache.folder() / "demonstrations" / f"{scene.name}-{fingerprint(scene, count, seed)}.npz"
-    leaves = _read(file, jax.tree.leaves(shapes))
+    leaves = _fitting(cache.read_arrays(file), jax.tree.leaves(shapes))
     if leaves is None:
         leaves = jax.tree.leaves(_made(make, count, seed, CHUNK))
-        _write(file, leaves)
+        cache.write_arrays(file, {str(i): x for i, x in enumerate(leaves)})
     return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
 
 
@@ -112,16 +106,8 @@ def fingerprint(scene: Scene, count: int, seed: int) -> str:
     here = Path(__file__).parent
     code = [here / name for name in ("dataset.py", "keys.py", "rollout.py", "geometry.py")] + [Path(inspect.getfile(type(scene)))]
     code += [file for folder in ("scenes", "logs", "physics", "specialise") for file in sorted((here / folder).glob("*.py"))]
-    made_by = {
-        "settings": dataclasses.asdict(scene),
-        "code": hashlib.sha256(b"".join(file.read_bytes() for file in code)).hexdigest(),
-        "versions": [metadata.version(name) for name in ("jax", "mujoco", "mujoco-mjx")],
-        "world": scene.world.fingerprint,
-        "type": str(jnp.zeros(0).dtype),
-        "count": count,
-        "seed": seed,
-    }
-    return hashlib.sha256(json.dumps(made_by, sort_keys=True).encode()).hexdigest()[:16]
+    made_by = {"settings": dataclasses.asdict(scene), "world": scene.world.fingerprint, "count": count, "seed": seed}
+    return cache.fingerprint(made_by, code)
 
 
 def statistics(scene: Scene, expert: Demonstration) -> Statistics:
@@ -159,27 +145,8 @@ def without_truth(demonstrations: Demonstration) -> Demonstration:
     return Demonstration(episode, trajectory, ())
 
 
-def _read(file: Path, shapes: list[jax.ShapeDtypeStruct]) -> list[np.ndarray] | None:
-    """The arrays of a cache file; None where it is absent or damaged (it is then made again)."""
-    try:
-        with file.open("rb") as opened, np.load(opened, allow_pickle=False) as held:
-            leaves = [held[str(i)] for i in range(len(shapes))]
-    except (OSError, ValueError, KeyError, EOFError, cache.DAMAGED):
-        return None
-    fits = all(x.shape == s.shape and x.dtype == s.dtype for x, s in zip(leaves, shapes, strict=True))
+def _fitting(arrays: dict[str, np.ndarray] | None, shapes: list[jax.ShapeDtypeStruct]) -> list[np.ndarray] | None:
+    """The leaves that a cache file holds; None where they do not fit (they are then made again)."""
+    leaves = [] if arrays is None else [arrays[str(i)] for i in range(len(shapes)) if str(i) in arrays]
+    fits = len(leaves) == len(shapes) and all(x.shape == s.shape and x.dtype == s.dtype for x, s in zip(leaves, shapes, strict=True))
     return leaves if fits else None
-
-
-def _write(file: Path, leaves: list[np.ndarray]) -> None:
-    """Writes beside and renames, so that a reader or a second writer never sees half a file; without a place to write, goes on."""
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".part", delete=False) as part:
-            try:
-                np.savez(part, allow_pickle=False, **{str(i): x for i, x in enumerate(leaves)})
-            except OSError:
-                os.unlink(part.name)
-                raise
-        os.replace(part.name, file)
-    except OSError as error:
-        logging.getLogger("rtc_mjx").warning("demonstrations cannot be kept in %s: %s", file.parent, error.strerror)

@@ -110,7 +110,7 @@ def test_features_and_metrics_are_finite_and_the_expert_equals_itself(scene):
 def test_demonstrations_come_from_the_cache_unchanged(scene, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     first = dataset.demonstrations(scene, 8, 3)
-    (file,) = tmp_path.rglob("*.npz")
+    (file,) = tmp_path.rglob("demonstrations/*.npz")
     stamp = file.stat().st_mtime_ns
     second = dataset.demonstrations(scene, 8, 3)
     assert file.stat().st_mtime_ns == stamp

@@ -9,7 +9,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jax.scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from rtc_mjx.errors import UsageError
-from rtc_mjx.specialise import compress, emit, specialise
+from rtc_mjx.specialise import compress, emit, kernel, specialise
 
 QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}  # compiling is most of this file's time
 TOLERANCE = {"float32": 3e-4, "float64": 1e-10}
@@ -370,6 +370,19 @@ def long_program(length):
 
 def kernels(function, *inputs):
     return jax.jit(function).lower(*inputs).as_text().count("stablehlo.reduce(")
+
+
+def test_kernels_are_traced_no_more_often_than_they_stand_in_the_lowered_program(monkeypatch, x64):
+    traced, run = [], kernel.run_scalars
+    monkeypatch.setattr(kernel, "run_scalars", lambda graph, part, values: (traced.append(part), run(graph, part, values)))
+    state = {"x": draw("float64", 3, 2), "count": jnp.zeros((3, 1), int)}
+    ours = jax.checkpoint(specialise(composed, *jax.tree.map(lambda x: x[0], (state, state["x"])), mode="kernel"))
+
+    def loss(pushes):
+        return jnp.sum(jax.vmap(over_time(ours))(state, pushes)[0])
+
+    text = jax.jit(jax.value_and_grad(loss)).lower(draw("float64", 3, 5, 2)).as_text()
+    assert 0 < len(traced) <= text.count("stablehlo.reduce(") - text.count("applies stablehlo.add")  # the others are sums
 
 
 COMPRESSED = {  # (function, how many numbers are passed on)

@@ -7,6 +7,8 @@ world, the two pyramid edges along z) is handed to the next as such, not as data
 
 import functools
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +17,7 @@ from jax import lax
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array
 
+from rtc_mjx import cache
 from rtc_mjx.physics import contact
 from rtc_mjx.physics.rollout import OneStep
 from rtc_mjx.physics.step import (
@@ -30,8 +33,11 @@ from rtc_mjx.physics.step import (
     rest_surroundings,
     step,
 )
-from rtc_mjx.physics.world import Part, World, double_precision
-from rtc_mjx.specialise import Mode, compress, specialise
+from rtc_mjx.physics.world import Part, World, double_precision, model_hash
+from rtc_mjx.specialise import Mode, Program, Specialised, compress, kept, specialise
+
+PACKAGE = Path(__file__).resolve().parents[1]
+SOURCES = [PACKAGE / "pytree.py", *(file for folder in ("physics", "specialise") for file in sorted((PACKAGE / folder).glob("*.py")))]
 
 
 def specialised_step(world: World, mode: Mode | None = None) -> OneStep:
@@ -52,12 +58,49 @@ def specialised_step(world: World, mode: Mode | None = None) -> OneStep:
 def _specialised_step(world: World, mode: Mode | None, x64: bool) -> OneStep:
     del x64  # part of the key: programs are folded in one precision
     state, control = rest_state(world), jnp.zeros(len(world.control_ids))
-    if not constraint_rows(world):
-        whole = specialise(lambda s, c: step(world, s, c, rest_surroundings(world)), state, control, mode=mode)
+    programs = kept(_fingerprint(world), lambda: _folded(world, state, control))
+
+    def stage(name: str, result: Any, *examples: Any) -> Specialised:
+        return Specialised(programs[name], jax.tree.structure(result), jax.tree.structure(examples), mode)
+
+    if "whole" in programs:
+        whole = stage("whole", state, state, control)
         return lambda s, c, _: whole(s, c)
-    terms, as_terms = compress(lambda s, c: dynamics(world, s, c), state, control, mode=mode)
-    packed = jax.eval_shape(terms, state, control)
-    as_rows, users = _rows_stage(world, state, mode)
+    pose, size, vector = jnp.zeros(3), jnp.zeros(2), jnp.zeros(0)
+    terms, advance = stage("terms", vector, state, control), stage("advance", (vector, vector), vector, vector, vector)
+    last = stage("last", state, state, vector, vector, vector)
+    rows = jax.vmap(stage("rows", vector, state, pose, size), in_axes=(None, 0, 0)) if world.one_user else None
+    index = np.array(world.users, int)  # not a device array: the step is kept, and may be made while another is traced
+
+    def one_step(s: PhysicsState, c: Array, around: Surroundings) -> PhysicsState:
+        free = terms(s, c)
+        touching = rows(s, around.pose[index], around.size[index]) if rows else jnp.zeros((0, 0), s.qpos.dtype)
+        start, held, near = lax.stop_gradient((s.warmstart, free, touching))  # the derivative is implicit: see contact.exact
+        solution, _ = contact.iterate(lambda q: advance(q, held, near), start)
+        return last(s, free, touching, checkpoint_name(solution, contact.SOLUTION))
+
+    return one_step
+
+
+def _fingerprint(world: World) -> str:
+    """Hash of all that determines the programs of a world: what its step reads, and the code that makes and folds it."""
+    parts = [part for part in (world.free, world.one_user) if part]
+    made_by = {
+        "models": [model_hash(model) for model in (world.mj, *(part.mj for part in parts))],
+        "parts": [(part.planar, part.user_body, part.user_geom, part.user_rows) for part in parts],
+        "world": (world.control_ids, world.mocap_ids, world.users),
+        "device": jax.default_backend(),  # it evaluates what is constant
+    }
+    return cache.fingerprint(made_by, SOURCES)
+
+
+def _folded(world: World, state: PhysicsState, control: Array) -> dict[str, Program]:
+    """The stages of a world's step by name: the `whole`, or `terms`, `rows` of one user, `advance` (a Newton step) and `last`."""
+    if not constraint_rows(world):
+        return {"whole": specialise(lambda s, c: step(world, s, c, rest_surroundings(world)), state, control).program}
+    compact, as_terms = compress(lambda s, c: dynamics(world, s, c), state, control)
+    terms = compact.program
+    rows, as_rows = _folded_rows(world, state)
 
     def problem(terms_vector: Array, rows_vectors: Array) -> tuple[Dynamics, contact.ContactProblem]:
         parts = [as_rows(rows_vectors[i]) for i in range(len(world.users))] or [_no_rows(world)]
@@ -70,32 +113,19 @@ def _specialised_step(world: World, mode: Mode | None, x64: bool) -> OneStep:
     def conclude(s: PhysicsState, terms_vector: Array, rows_vectors: Array, solution: Array) -> PhysicsState:
         return finish(world, s, *problem(terms_vector, rows_vectors), solution)
 
-    row_shapes = jax.eval_shape(users, state, rest_surroundings(world))
-    advance = specialise(newton_step, state.warmstart, packed, row_shapes, mode=mode)
-    last = specialise(conclude, state, packed, row_shapes, state.warmstart, mode=mode)
-
-    def one_step(s: PhysicsState, c: Array, around: Surroundings) -> PhysicsState:
-        free, touching = terms(s, c), users(s, around)
-        start, held, near = lax.stop_gradient((s.warmstart, free, touching))  # the derivative is implicit: see contact.exact
-        solution, _ = contact.iterate(lambda q: advance(q, held, near), start)
-        return last(s, free, touching, checkpoint_name(solution, contact.SOLUTION))
-
-    return one_step
+    given = jnp.zeros(terms.outputs[0].size), jnp.zeros((len(world.users), rows.outputs[0].size if rows else 0))
+    advance, last = specialise(newton_step, state.warmstart, *given), specialise(conclude, state, *given, state.warmstart)
+    made = {"terms": terms, "rows": rows, "advance": advance.program, "last": last.program}
+    return {name: program for name, program in made.items() if program}
 
 
-def _rows_stage(world: World, state: PhysicsState, mode: Mode | None) -> tuple[Callable[..., contact.Rows], Callable[..., Array]]:
-    """From one user's vector to its rows, and the program that gives the vectors of all users."""
+def _folded_rows(world: World, state: PhysicsState) -> tuple[Program | None, Callable[..., contact.Rows]]:
+    """The program that gives one user's vector, and from the vector to the user's rows."""
     if not world.one_user:
-        return lambda vector: _no_rows(world), lambda s, around: jnp.zeros((0, 0), s.qpos.dtype)
-    pose, size = jnp.zeros(3), jnp.zeros(2)
+        return None, lambda vector: _no_rows(world)
     halve, restore = (_halved, _restored) if _is_flat_pyramid(world.one_user) else (lambda rows: rows, lambda rows: rows)
-    rows, expand = compress(lambda s, p, z: halve(one_user_rows(world, s, p, z)), state, pose, size, mode=mode)
-    index = np.array(world.users, int)  # not a device array: the program is kept, and may be made while another is traced
-
-    def over_users(s: PhysicsState, around: Surroundings) -> Array:
-        return jax.vmap(rows, in_axes=(None, 0, 0))(s, around.pose[index], around.size[index])
-
-    return lambda vector: restore(expand(vector)), over_users
+    rows, expand = compress(lambda s, p, z: halve(one_user_rows(world, s, p, z)), state, jnp.zeros(3), jnp.zeros(2))
+    return rows.program, lambda vector: restore(expand(vector))
 
 
 def _is_flat_pyramid(part: Part) -> bool:

@@ -106,9 +106,7 @@ class World:
     @functools.cached_property
     def fingerprint(self) -> str:
         """Hash of the compiled model: two worlds with the same fingerprint step alike."""
-        buffer = np.empty(mujoco.mj_sizeModel(self.mj), np.uint8)
-        mujoco.mj_saveModel(self.mj, None, buffer)
-        return hashlib.sha256(buffer.tobytes()).hexdigest()
+        return model_hash(self.mj)
 
     @property
     def default_sizes(self) -> Float[np.ndarray, "users 2"]:
@@ -132,6 +130,13 @@ class World:
         if name not in self.control_names:
             raise UsageError(f"world '{self.name}' has no control '{name}'; it has {', '.join(self.control_names)}")
         return self.control_names.index(name)
+
+
+def model_hash(model: mujoco.MjModel) -> str:
+    """Hash of every number and name in a compiled model, as they are at the call."""
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return hashlib.sha256(buffer.tobytes()).hexdigest()
 
 
 def place_surroundings(data: Any, pose: Float[np.ndarray, "users 3"]) -> None:

@@ -7,5 +7,6 @@ emits it (`emit`). The result is an ordinary JAX function: jit, vmap, scan and r
 
 from rtc_mjx.specialise.emit import Mode, default_mode
 from rtc_mjx.specialise.program import Program, Specialised, compress, specialise
+from rtc_mjx.specialise.stored import kept
 
-__all__ = ["Mode", "Program", "Specialised", "compress", "default_mode", "specialise"]
+__all__ = ["Mode", "Program", "Specialised", "compress", "default_mode", "kept", "specialise"]

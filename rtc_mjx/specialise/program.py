@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.custom_derivatives import SymbolicZero
 
 from rtc_mjx.errors import UsageError
@@ -124,9 +125,7 @@ def specialise(function: Callable[..., Any], *examples: Any, mode: emit.Mode | N
     return Specialised(program, structure, jax.tree.structure(examples), mode)
 
 
-def compress(
-    function: Callable[..., Any], *examples: Any, mode: emit.Mode | None = None
-) -> tuple[Callable[..., jax.Array], Callable[[jax.Array], Any]]:
+def compress(function: Callable[..., Any], *examples: Any, mode: emit.Mode | None = None) -> tuple[Specialised, Callable[[jax.Array], Any]]:
     """Specialises a function whose result goes into another specialised function, without losing what is known about it.
 
     Returns:
@@ -193,34 +192,43 @@ def trace(function: Callable[..., Any], *examples: Any) -> tuple[Program, Any]:
 
 @functools.lru_cache(maxsize=256)
 def _call(program: Program, mode: emit.Mode) -> Callable[..., tuple[jax.Array, ...]]:
-    """The program on flat arrays, with its own reverse-mode rule: residuals are its inputs and its saved nodes."""
+    """The program on flat arrays, with its own reverse-mode rule: residuals are its inputs and its saved nodes.
 
-    def run(arrays: Sequence[jax.Array], extra: Sequence[Node]) -> tuple[tuple[jax.Array, ...], list[jax.Array]]:
+    Both directions are jitted inside: JAX goes over a step several times (for scan, checkpoint and its derivative) and finds
+    what it has traced, batched and lowered before.
+    """
+
+    @functools.partial(jax.jit, static_argnames="keep")
+    def run(arrays: Sequence[jax.Array], keep: bool) -> tuple[tuple[jax.Array, ...], list[jax.Array]]:
         given = dict(zip(program.input_nodes, _scalars(arrays), strict=True))
-        values = emit.evaluate(program.graph, given, [*program.output_nodes, *extra], mode)
+        values = emit.evaluate(program.graph, given, [*program.output_nodes, *(program.saved if keep else ())], mode)
         count = len(program.output_nodes)
         return _pack(values[:count], program.outputs, program.types), values[count:]
 
-    @jax.custom_vjp
-    def call(*arrays: jax.Array) -> tuple[jax.Array, ...]:
-        return run(arrays, ())[0]
-
-    def forward(*primals: Any) -> Any:
-        arrays = [p.value for p in primals]
-        outputs, saved = run(arrays, program.saved)
-        return outputs, (_Wanted(tuple(bool(p.perturbed) for p in primals)), arrays, saved)
-
-    def backward(residuals: Any, cotangents: Sequence[Any]) -> tuple[Any, ...]:
-        mask, arrays, saved = residuals
-        adjoints = program.backward(mask.inputs)
-        seeds = [_zeros(c) for c, nodes in zip(cotangents, program.outputs, strict=True) if _is_float(program.graph, nodes)]
+    @jax.jit
+    def run_back(wanted: "_Wanted", arrays: Sequence[jax.Array], saved: Sequence[jax.Array], seeds: Sequence[jax.Array]) -> list[Any]:
+        adjoints = program.backward(wanted.inputs)
         given = dict(zip(program.input_nodes, _scalars(arrays), strict=True))
         given |= dict(zip(program.saved, saved, strict=True)) | dict(zip(adjoints.seeds, _scalars(seeds), strict=True))
         values = iter(emit.evaluate(program.graph, given, adjoints.outputs, mode))
-        return tuple(
-            _stack([next(values) for _ in range(int(np.prod(shape)))], shape, dtype) if wanted else None
-            for wanted, (shape, dtype) in zip(mask.inputs, program.inputs, strict=True)
-        )
+        return [
+            _stack([next(values) for _ in range(int(np.prod(shape)))], shape, dtype) if chosen else None
+            for chosen, (shape, dtype) in zip(wanted.inputs, program.inputs, strict=True)
+        ]
+
+    @jax.custom_vjp
+    def call(*arrays: jax.Array) -> tuple[jax.Array, ...]:
+        return run(arrays, keep=False)[0]
+
+    def forward(*primals: Any) -> Any:
+        arrays = [p.value for p in primals]
+        outputs, saved = run(arrays, keep=True)
+        return outputs, (_Wanted(tuple(bool(p.perturbed) for p in primals)), arrays, saved)
+
+    def backward(residuals: Any, cotangents: Sequence[Any]) -> tuple[Any, ...]:
+        wanted, arrays, saved = residuals
+        seeds = [_zeros(c) for c, nodes in zip(cotangents, program.outputs, strict=True) if _is_float(program.graph, nodes)]
+        return tuple(run_back(wanted, arrays, saved, seeds))
 
     call.defvjp(forward, backward, symbolic_zeros=True)
     return call
@@ -245,11 +253,14 @@ def _zeros(cotangent: Any) -> jax.Array:
 
 
 def _scalars(arrays: Sequence[Any]) -> list[Any]:
-    return [x for array in arrays for x in jnp.ravel(array)]
+    """The numbers of arrays, one by one; indexing would take JAX twice as long to trace."""
+    flat = [lax.reshape(x, (x.size,)) for x in arrays]
+    return [lax.reshape(part, ()) for x in flat if x.size for part in lax.split(x, (1,) * x.size)]
 
 
 def _stack(scalars: Sequence[Any], shape: tuple[int, ...], dtype: Any) -> jax.Array:
-    return jnp.stack([jnp.asarray(x, dtype) for x in scalars]).reshape(shape) if scalars else jnp.zeros(shape, dtype)
+    parts = [lax.reshape(lax.convert_element_type(x, dtype), (1,)) for x in scalars]
+    return lax.reshape(lax.concatenate(parts, 0), shape) if parts else jnp.zeros(shape, dtype)
 
 
 def _pack(values: Sequence[Any], outputs: Sequence[np.ndarray], types: Sequence[np.dtype]) -> tuple[jax.Array, ...]:
