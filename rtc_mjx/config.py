@@ -190,7 +190,7 @@ def defaults(scene: str, method: str) -> Config:
                 raise UsageError(f"{file}: '{key}' is chosen on the command line")
     merged = merge(merge(config, table, str(file)), by_method.get(method, {}), f"{file} [methods.{method}]")
     try:
-        return check(merged)
+        return check_values(merged)
     except UsageError as error:
         raise UsageError(f"{file}: {error}") from error
 
@@ -295,6 +295,18 @@ def _typed(value: Any, kind: Any, where: str) -> Any:
 
 
 def check(config: Config) -> Config:
+    """The settings, if every value is in its range, they fit each other, and the method can run on the scene.
+
+    Raises:
+        UsageError: the first that is not; one line with its option and what is accepted.
+    """
+    config = check_values(config)
+    if METHODS[config.method].kind == "label" and not config.scene.labels:
+        raise UsageError(f"--method {config.method}: scene {config.scene.name} {config.scene.unlabelled}")
+    return config
+
+
+def check_values(config: Config) -> Config:
     """The settings, if every value is in its range and they fit each other.
 
     Raises:
@@ -322,8 +334,6 @@ def check(config: Config) -> Config:
     shares = {b.share for b in METHODS[method_name(config.method)].branches}
     if "rest" in shares and not 0 < split < config.batch:
         raise UsageError(f"--encoder-share {config.encoder_share}: of a batch of {config.batch} both parts need an episode")
-    if METHODS[method_name(config.method)].kind == "label" and not config.scene.labels:
-        raise UsageError(f"--method {config.method}: scene {config.scene.name} has no hand-made labels")
     return dataclasses.replace(config, method=method_name(config.method))
 
 

@@ -1,4 +1,4 @@
-"""Laws of every driving scene, of the road graph and the routes found in it, and of driving's metrics."""
+"""Laws of every generated driving scene, of the road graph and the routes found in it, and of driving's metrics."""
 
 import dataclasses
 
@@ -19,16 +19,17 @@ from rtc_mjx.models import ModelOptions
 from rtc_mjx.physics import PhysicsState, specialised_step, substates
 from rtc_mjx.rollout import rollout
 from rtc_mjx.scenes import SCENES, Actor, split_items
-from rtc_mjx.scenes.driving import AWAY, CAR, OWN, Driving, crossings, nearest_users, ran_red
+from rtc_mjx.scenes.driving import AWAY, CAR, OWN, crossings, nearest_users, ran_red
+from rtc_mjx.scenes.generated import Generated
 from rtc_mjx.scenes.intersection import cycle
 from rtc_mjx.scenes.routes import BEHIND, NOWHERE, RouteOptions, find_routes
 from rtc_mjx.scenes.traffic import Drivers, Walkers, drive, follow_the_leader, must_stop, slow_for_bends, walk
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
-DRIVING = tuple(name for name, scene in SCENES.items() if issubclass(scene, Driving))
+GENERATED = tuple(name for name, scene in SCENES.items() if issubclass(scene, Generated))
 
 
-@pytest.fixture(params=DRIVING)
+@pytest.fixture(params=GENERATED)
 def scene(request):
     return made(request.param)
 

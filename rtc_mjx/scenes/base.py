@@ -89,6 +89,11 @@ class Scene(abc.ABC):
         return 0
 
     @property
+    def unlabelled(self) -> str:
+        """Why there are no hand-made types, where there are none."""
+        return "has no hand-made labels"
+
+    @property
     def sets(self) -> tuple[ItemSet, ...]:
         """What observations end with: sets of items, whose order means nothing."""
         return ()

@@ -33,7 +33,7 @@ from rtc_mjx.scenes.routes import RouteOptions
 from rtc_mjx.trajectory import Episode
 
 Part = Literal["train", "test"]
-FOLLOWED = 0.5  # m, mean error of position up to which a car follows its log
+FOLLOWED, HEADED = 0.5, 0.25  # m and rad, mean errors of position and heading up to which a car follows its log
 KEPT_ROAD_USERS = 24  # of a converted scene; of these, those nearest to the agent have bodies
 
 
@@ -80,7 +80,7 @@ class Recorded(Driving):
 
     name: ClassVar[str] = "womd"
     redrivable: ClassVar[bool] = False
-    route_options: ClassVar[RouteOptions] = RouteOptions(lanes=5)
+    route_options: ClassVar[RouteOptions] = RouteOptions(count=6, lanes=6)
     data: str = ""
     control: Control = "moving"
     start: float = 0.0
@@ -109,6 +109,12 @@ class Recorded(Driving):
     def labels(self) -> int:
         """Symphony's hand-made types: the routes; none where lane connectivity was not logged."""
         return self.route_options.count if self.connected else 0
+
+    @property
+    def unlabelled(self) -> str:
+        """Which recording does not know its lanes' connections."""
+        first = next(held for held in self.converted if held.connectivity != "logged")
+        return f"has no labels: recording {_scenario(first)} does not log which lane connects to which (it is {first.connectivity})"
 
     def pool(self, part: Part) -> Pool:
         """The scenes of one part.
@@ -195,8 +201,8 @@ def _gathered(scene: Recorded, part: Part) -> Pool:
         raise UsageError(f"{scene.data}: of {len(scene.converted)} scenes none is left to {part}; give more recordings")
     logs = jax.tree.map(lambda *x: np.stack(x), *(held.scene for held in chosen))
     fit = fitted(scene, logs)
-    error = np.mean(fit.position_error, axis=1)
-    follows = error <= FOLLOWED
+    error, turned = np.mean(fit.position_error, axis=1), np.mean(fit.heading_error, axis=1)
+    follows = (error <= FOLLOWED) & (turned <= HEADED)
     left_out = {held.name: float(e) for held, e, good in zip(chosen, error, follows, strict=True) if not good}
     if not np.any(follows):
         raise UsageError(f"{scene.data}: no car can follow any of the {len(chosen)} agents to {part}")

@@ -16,7 +16,7 @@ from rtc_mjx.pytree import pytree
 
 SPACING = 2.0  # m between two points of a route
 BEHIND = 10.0  # m of a route behind the agent's start
-SEARCHED = 200  # points of a route among which the agent's start is looked for
+SEARCHED = 400  # points of a route among which the agent's start is looked for
 NOWHERE = 1e3  # m, the station of a line that is not there
 
 
@@ -70,8 +70,10 @@ def find_routes(scene: LoggedScene, start: Pose, options: RouteOptions) -> Route
     """The routes from a pose."""
     road = scene.road
     sequences, dropped = follow(road, nearest_lane(road, start), options)
-    routes = jax.vmap(lambda lanes: _one_route(scene, lanes, start, options), out_axes=_AXES)(sequences)
-    return dataclasses.replace(routes, dropped=dropped)
+    valid = sequences[:, 0] >= 0
+    drawn = jnp.where(valid[:, None], sequences, sequences[0])  # one that is not there has a length all the same: it is differentiated by
+    routes = jax.vmap(lambda lanes: _one_route(scene, lanes, start, options), out_axes=_AXES)(drawn)
+    return dataclasses.replace(routes, lanes=sequences, valid=valid, dropped=dropped)
 
 
 def nearest_lane(road: RoadGraph, start: Pose) -> Int[Array, ""]:

@@ -1,0 +1,126 @@
+"""Recorded traffic as a scene: controls by inverse dynamics, replayed drivers, parts that share nothing, every method on it."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import recorded as files
+from jax import random
+from made import made, recordings
+
+from rtc_mjx import config, dataset, evaluate, inverse_dynamics, train
+from rtc_mjx.errors import UsageError
+from rtc_mjx.inverse_dynamics import FitOptions, fit, start_of
+from rtc_mjx.logs.convert import Options
+from rtc_mjx.logs.store import scenes
+from rtc_mjx.methods import METHODS
+from rtc_mjx.physics import rest_surroundings, simulate, specialised_step
+from rtc_mjx.scenes.recorded import FOLLOWED, HEADED, Recorded, fitted, part_of
+
+STEP, SUBSTEPS = 0.3, 6
+KINDS = ("womd_scenario", "womd_tf_example", "gpudrive_json", "scenarionet_waymo", "scenarionet_nuscenes")
+
+
+def driven(key, steps=30):
+    """Poses of a car under smooth random controls, and the controls."""
+    world = inverse_dynamics.alone()
+    pull, bend = random.split(key)
+    knots = jnp.linspace(0, 5, steps)
+
+    def smooth(key, size):
+        return size * jnp.interp(knots, jnp.arange(6.0), random.normal(key, (6,)))
+
+    actions = jnp.stack([smooth(pull, 0.8), smooth(bend, 0.05)], axis=1)
+    start = start_of(jnp.zeros((2, 3)), jnp.array([9.0, 0.0]), STEP)
+    step = specialised_step(world)
+    _, states = simulate(world, start, actions, rest_surroundings(world), substeps=SUBSTEPS, one_step=step)
+    return jnp.concatenate([start.qpos[None], states.qpos])[:, :3], actions
+
+
+@jax.jit
+def followed(poses):
+    return jax.vmap(lambda p: fit(start_of(jnp.zeros((2, 3)), jnp.array([9.0, 0.0]), STEP), p, SUBSTEPS, FitOptions(updates=100)))(poses)
+
+
+def test_a_path_that_the_car_drove_is_followed_to_a_centimetre():
+    poses, actions = jax.jit(jax.vmap(driven))(random.split(random.key(0), 16))
+    found = followed(poses)
+    assert np.median(found.position_error) < 0.01 and np.max(found.position_error) < 0.1
+    assert np.median(np.abs(found.actions - actions), axis=(0, 1)) == pytest.approx([0, 0], abs=0.05)
+
+
+def test_a_path_that_no_car_can_drive_is_told_by_its_error():
+    """It moves sideways at 3 m/s, its heading ahead all the time."""
+    poses = jnp.stack([9.0 * STEP * jnp.arange(31), 3.0 * STEP * jnp.arange(31), jnp.zeros(31)], axis=1)[None]
+    found = followed(poses)
+    assert np.mean(found.position_error) > FOLLOWED or np.mean(found.heading_error) > HEADED
+
+
+def test_controls_replayed_without_the_driver_give_the_same_motion():
+    poses, _ = jax.jit(jax.vmap(driven))(random.split(random.key(1), 4))
+    found, world = followed(poses), inverse_dynamics.alone()
+    start = start_of(jnp.zeros((2, 3)), jnp.array([9.0, 0.0]), STEP)
+    for i in range(4):
+        _, states = simulate(world, start, found.actions[i], rest_surroundings(world), substeps=SUBSTEPS, one_step=specialised_step(world))
+        off = np.linalg.norm(states.qpos[:, :2] - poses[i, 1:, :2], axis=1)
+        assert np.allclose(off, found.position_error[i, 1:], atol=2e-3)
+
+
+def test_logged_drivers_are_followed():
+    """Over the vehicles that move in all recordings at hand: median 0.15 m and 95th percentile 0.5 m are wanted."""
+    logs = [held.scene for held in scenes([recordings(*KINDS)], Options(road_users=4, lanes=4, edges=4))]
+    found = fitted(made("womd"), jax.tree.map(lambda *x: np.stack(x), *logs))
+    assert len(logs) > 200
+    assert np.median(found.position_error) < 0.05 and np.percentile(found.position_error, 95) < 0.2
+    assert np.mean(np.mean(found.position_error, axis=1) > FOLLOWED) < 0.02
+
+
+def test_replayed_experts_stay_with_the_log():
+    scene = made("womd")
+    held = dataset.demonstrations(scene, 64, dataset.TEST)
+    logs = scene.pool("test").logs
+    where = np.stack([log[agent][::3] for log, agent in zip(logs.pose, logs.controlled, strict=True)])[: len(held.trajectory.states.qpos)]
+    off = np.linalg.norm(held.trajectory.states.qpos[..., :2] - where[..., :2], axis=-1)
+    assert np.median(off) < 0.05 and np.percentile(off, 95) < 0.3
+
+
+def test_parts_share_no_recording_and_leave_none_out():
+    scene = made("womd")
+    parts = {part: part_of(scene.converted, part, scene.train_share) for part in ("train", "test")}
+    recorded = {part: {held.name.rsplit("/", 1)[0] for held in held} for part, held in parts.items()}
+    assert not recorded["train"] & recorded["test"] and len(recorded["train"]) == 6 and len(recorded["test"]) == 3
+    assert sum(len(held) for held in parts.values()) == len(scene.converted)
+
+
+def test_recorded_scenes_say_what_they_cannot_do(tmp_path):
+    with pytest.raises(UsageError, match=r"--scene\.data.*where the recordings are"):
+        Recorded().pool("train")
+    with pytest.raises(UsageError, match=r"--scene\.steps 40"):
+        dataclasses.replace(made("womd"), steps=40).pool("train")
+    with pytest.raises(UsageError, match="one expert each"):
+        dataset.by_others(made("womd"), 4, dataset.TEST, 2)
+    (tmp_path / "one.json").write_bytes(files.written("gpudrive_json"))
+    unconnected = ["--scene", "womd", "--scene.data", str(tmp_path / "one.json"), "--method", "symphony"]
+    with pytest.raises(UsageError, match=r"symphony.*connect"):
+        config.from_command_line(unconnected, "train")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_trains_on_recordings(method, tmp_path):
+    """A real, short training on real scenes, with evaluation for one of them."""
+    argv = ["--scene", "womd", "--scene.data", recordings("scenarionet_waymo"), "--method", method, "--run", str(tmp_path / "run")]
+    small = {
+        "scene.steps": 5, "scene.road-users": 1, "updates": 2, "batch": 4, "experts.train": 8, "experts.test": 4,
+        "every.log": 1, "every.test": 2, "every.save": 2, "model.width": 8, "model.discriminator-width": 8, "model.type-size": 2, "model.prior-components": 2,
+    }  # fmt: skip
+    settings = config.from_command_line([*argv, *(x for name, value in small.items() for x in (f"--{name}", str(value)))], "train")
+    run = train.train(settings)
+    line = run.metrics()[-1]
+    assert line["update"] == 2 and line.get("trajectories_dropped", [0.0]) == [0.0] and "curvature_jsd" in line
+    if method == "rtc_c":
+        result = evaluate.evaluate(run, 4)
+        assert result["reaction"] == {} and json.dumps(result)
+        assert result["reference"]["expert"]["min_ade"] == 0.0
