@@ -121,7 +121,7 @@ class Config:
 
 
 LEAST = {
-    **dict.fromkeys(("updates", "seeds", "every.log", "every.test", "every.save", "scene.steps"), 1),
+    **dict.fromkeys(("updates", "seeds", "every.log", "every.test", "every.save", "scene.steps", "scene.road_users"), 1),
     **{f"model.{name}": 1 for name in ("width", "discriminator_width", "depth", "mixture", "type_size", "prior_components")},
     **dict.fromkeys(("batch", "experts.train", "experts.test"), 4),
     **dict.fromkeys(
@@ -138,7 +138,7 @@ POSITIVE = (
     "optimiser.trajectory_clip",
 )
 NOT_NEGATIVE = tuple(f"losses.{f.name}" for f in dataclasses.fields(LossWeights) if f.type is float or f.type == "float")
-SHARES = ("encoder_share", "optimiser.final_rate", "optimiser.decay", "scene.lower_probability")
+SHARES = ("encoder_share", "optimiser.final_rate", "optimiser.decay", "scene.lower_probability", "scene.train_share")
 
 
 def configs() -> Path:

@@ -24,6 +24,7 @@ from rich.table import Table
 
 from rtc_mjx import cache, cli, dataset, metrics
 from rtc_mjx.agent_types import SOURCES
+from rtc_mjx.challenge import challenge
 from rtc_mjx.config import Config
 from rtc_mjx.errors import RunError, UsageError
 from rtc_mjx.files import write_whole
@@ -33,7 +34,7 @@ from rtc_mjx.methods import Method
 from rtc_mjx.models import Networks
 from rtc_mjx.pytree import in_parts
 from rtc_mjx.runs import Run
-from rtc_mjx.scenes import Scene
+from rtc_mjx.scenes import Recorded, Scene
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
 AT_ONCE = 2048  # rollouts simulated at once
@@ -128,7 +129,11 @@ def evaluate(run: Run, episodes: int, watch: Watch = iter) -> dict[str, Any]:
     expert, second = (expert_features(config.scene, test) for test in tests)
     table = score(config, features, expert)
     means = {source: _summaries(config, features[source], expert, table[source]) for source in table}
-    return {
+    scene = config.scene
+    recorded = (
+        {"sim_agents": challenge(scene, learner, state.networks, episodes, stream("evaluation", 1))} if isinstance(scene, Recorded) else {}
+    )
+    return recorded | {
         "scene": config.scene.name,
         "method": config.method,
         "seeds": config.seeds,
@@ -203,6 +208,15 @@ def table(result: dict[str, Any]) -> Table:
     return out
 
 
+def likeness(figures: dict[str, Any]) -> Table:
+    """The Sim Agents figures of recorded scenes for the terminal: the agent's, mean over seeds, beside what log replay scores."""
+    out = Table("Sim Agents figure", "prior types", "log replay", title="realism on recorded scenes (only the controlled agent is scored)")
+    for name, ceiling in figures["log_replay"].items():
+        ours = [seed[name] for seed in figures["prior"] if name in seed]
+        out.add_row(name.replace("_", " "), f"{np.mean(ours):.4g}" if ours else "-", f"{ceiling:.4g}")
+    return out
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     """Evaluates a run."""
     parser = cli.Parser(prog="python -m rtc_mjx.evaluate", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -217,6 +231,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     result = evaluate(run, options.episodes or run.config.experts.test, bar)
     console = Console(width=None if Console().is_terminal else 140)
     console.print(table(result))
+    if "sim_agents" in result:
+        console.print(likeness(result["sim_agents"]))
     for who, shares in result["reaction"].items():
         told = ", ".join(f"{name.replace('_', ' ')} {share:.3f}" for name, share in shares.items())
         console.print(f"luck turned round, {who}: {told}")

@@ -12,6 +12,7 @@ from jax import random
 from made import made, recordings
 
 from rtc_mjx import config, dataset, evaluate, inverse_dynamics, train
+from rtc_mjx.challenge import at_log_rate
 from rtc_mjx.errors import UsageError
 from rtc_mjx.inverse_dynamics import FitOptions, fit, start_of
 from rtc_mjx.learner import compiled_chunk, start_all
@@ -141,3 +142,17 @@ def test_a_training_on_recordings_is_tested_and_evaluated(tmp_path):
     result = evaluate.evaluate(run, 4)
     assert result["reaction"] == {} and result["reference"]["expert"]["min_ade"] == 0.0
     assert json.loads(json.dumps(result)) == result
+    (ours,), replay = result["sim_agents"]["prior"], result["sim_agents"]["log_replay"]
+    assert replay["average_displacement_error"] == 0 < ours["average_displacement_error"]
+    assert 0 < ours["realism_meta_metric"] < replay["realism_meta_metric"] <= 1
+
+
+def test_poses_at_the_rate_of_the_log_pass_through_those_of_the_control_steps():
+    scene = made("womd")
+    held = dataset.demonstrations(scene, 2, dataset.TEST)
+    one = jax.tree.map(lambda x: jnp.asarray(x[0]), dataset.without_truth(held))
+    fine = at_log_rate(scene, one.episode, one.trajectory)
+    assert fine.shape == (90, 4)
+    assert np.allclose(fine[2::3, jnp.array([0, 1, 3])], one.trajectory.states.qpos[1:, :3], atol=2e-3)
+    step = np.linalg.norm(np.diff(fine[:, :2], axis=0), axis=1)
+    assert np.max(np.abs(np.diff(step))) < 0.2  # no jump between control steps: less than 20 m/s^2

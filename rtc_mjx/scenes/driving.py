@@ -99,6 +99,11 @@ class Driving(Scene):
         return car_among(self.road_users)
 
     @property
+    def logged_times(self) -> int:
+        """How many logged times an episode takes."""
+        return CONTROL_EVERY * self.steps + 1
+
+    @property
     def control_unit(self) -> Float[np.ndarray, "controls"]:
         """1.5 m/s^2 and 0.08 rad."""
         return np.array([1.5, 0.08])

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from rtc_mjx.logs import VEHICLE, LoggedScene, RoadGraph
 from rtc_mjx.scenes.base import Actor
 from rtc_mjx.scenes.driver import expert_driver
-from rtc_mjx.scenes.driving import CAR, CONTROL_EVERY, Driving
+from rtc_mjx.scenes.driving import CAR, Driving
 from rtc_mjx.trajectory import Episode
 
 Others = tuple[Array, Array, Array, Array]  # poses (users, times, 3), velocities, sizes, kinds (users,)
@@ -26,11 +26,6 @@ class Generated(Driving):
     """
 
     speeds: ClassVar[tuple[float, float]]  # m/s, what the agent's drivers want on a free road
-
-    @property
-    def logged_times(self) -> int:
-        """How many times are logged."""
-        return CONTROL_EVERY * self.steps + 1
 
     def expert(self, key: jax.Array, episode: Episode) -> tuple[Actor, Any]:
         """A driver with a route and a temper of its own."""
