@@ -172,18 +172,25 @@ def realism(setup: Setup, episodes: int, experts: int) -> dict[str, Any]:
     Returns:
         By feature: `agent`, a list over seeds, and `floor`, the same between two groups of experts of the same size.
     """
-    scene, config = setup.config.scene, setup.config
+    scene = setup.config.scene
     held = jax.tree.map(lambda x: x[:episodes], setup.test)
     others = dataset.without_truth(dataset.by_others(scene, episodes, dataset.TEST, 2 * experts))
     theirs = jax.device_get(_described(scene, held, others))
     ours = evaluate.roller(setup.learner, experts)(setup.networks, held, {}, stream("type shift", 3))["prior"]
-    out: dict[str, Any] = {"episodes": episodes, "experts": experts, "features": {}}
-    for name in scene.described_by:
-        first, second = theirs[name][:, :experts], theirs[name][:, experts:]
-        limits = (float(theirs[name].min()), float(max(theirs[name].max(), theirs[name].min() + 1e-6)))
-        mean = functools.partial(_mean_jsd, limits=limits)
-        out["features"][name] = {"agent": [mean(ours[name][i].T, first) for i in range(config.seeds)], "floor": mean(second, first)}
-    return out
+    features = {name: compared(ours[name], theirs[name]) for name in scene.described_by}
+    return {"episodes": episodes, "experts": experts, "features": features}
+
+
+def compared(ours: np.ndarray, theirs: np.ndarray) -> dict[str, Any]:
+    """One feature of rollouts (seeds, rollouts, episodes) and of twice as many experts (episodes, experts): `agent` and `floor`.
+
+    The bins span what both do: experts may all do the same.
+    """
+    count = theirs.shape[1] // 2
+    first, second = theirs[:, :count], theirs[:, count:]
+    both = np.concatenate([np.ravel(x).astype(float) for x in (theirs, ours)])
+    mean = functools.partial(_mean_jsd, limits=(both.min(), max(both.max(), both.min() + 1e-6)))
+    return {"agent": [mean(of_seed.T, first) for of_seed in ours], "floor": mean(second, first)}
 
 
 def _described(scene: Scene, held: Demonstration, others: Demonstration) -> dict[str, Array]:

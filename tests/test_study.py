@@ -125,6 +125,15 @@ def test_a_folder_in_the_way_is_left_alone(tmp_path):
     assert (place / "thesis.txt").is_file()
 
 
+def test_conditional_realism_by_hand():
+    """Two episodes, two experts and as many again for the floor; the second of two agents does what no expert does in one episode."""
+    theirs = np.array([[1.0, 1.0, 1.0, 1.0], [0.0, 1.0, 1.0, 0.0]])
+    ours = np.array([[[1.0, 0.0], [1.0, 1.0]], [[0.0, 0.0], [0.0, 1.0]]])  # (agents, rollouts, episodes)
+    assert type_shift.compared(ours, theirs) == {"agent": [0.0, 0.5], "floor": 0.0}
+    alike = type_shift.compared(np.zeros((1, 2, 2)), np.ones((2, 4)))  # experts who all do the same tell one who does not
+    assert alike == {"agent": [1.0], "floor": 0.0}
+
+
 @pytest.mark.parametrize("method", ["rtc_d", "bc"])
 def test_the_analysis_of_types_says_what_is_there_to_say(method, tmp_path):
     folder = tmp_path / "run"
