@@ -2,8 +2,9 @@
 
     recorded episodes -> rollouts under prior types, everybody else replayed -> poses at 10 Hz -> `rtc_mjx.sim_agents.realism`
 
-Only the controlled agent of each scene is scored, over 9 s from its start, and there is no history: the challenge simulates all agents over
-8 s after 1.1 s. So these figures compare methods here with each other and with their ceiling, not with the challenge's table.
+Only the controlled agent of each scene is scored, from its start to the end of the episode, and there is no history: the challenge
+simulates all agents over 8 s after 1.1 s. So these figures compare methods here with each other and with their ceiling, not with the
+challenge's table.
 """
 
 import dataclasses
@@ -103,7 +104,7 @@ def challenge(scene: Recorded, learner: Learner, networks: Networks, count: int,
 
     run = jax.jit(lambda networks, held: jax.vmap(functools.partial(one, networks))(*held))
     seeds = [jax.tree.map(lambda x, i=i: x[i], networks) for i in range(len(jax.tree.leaves(networks)[0]))]
-    replay = in_parts(jax.jit(jax.vmap(lambda log: scored(log, _logged(scene, log)[None]))), logs, AT_ONCE)
+    replay = in_parts(jax.jit(jax.vmap(lambda log: scored(log, jnp.tile(_logged(scene, log), (ROLLOUTS, 1, 1))))), logs, AT_ONCE)
     found = [in_parts(functools.partial(run, one_seed), (logs, episodes, keys), AT_ONCE) for one_seed in seeds]
     return {"prior": [_means(figures) for figures in found], "log_replay": _means(replay)}
 

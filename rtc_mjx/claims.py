@@ -93,11 +93,11 @@ def comparisons(runs: Mapping[str, Run], against: str = "mgail") -> str:
             ours, theirs = (np.array(r["metrics"][metric]["per_seed"]) for r in (result, reference))
             low, high = metrics.bootstrap(ours - theirs)
             rows.append([name, metric, f"{np.mean(ours - theirs):+.4g}", f"[{low:+.4g}, {high:+.4g}]", f"{sign_flip(ours - theirs):.3g}"])
-    return _markdown(rows)
+    return _markdown(rows) if len(rows) > 2 else ""
 
 
 def sign_flip(differences: np.ndarray) -> float:
-    """Two-sided p-value of "the differences are as likely to have the other sign"; exact up to 20 seeds or so, then sampled."""
+    """Two-sided p-value of "the differences are as likely to have the other sign"; exact up to 16 seeds, then sampled."""
     done = stats.permutation_test((differences,), np.mean, permutation_type="samples", n_resamples=100_000, rng=np.random.default_rng(0))
     return float(done.pvalue)
 
@@ -115,7 +115,8 @@ def claims(scene: str, runs: Mapping[str, Run]) -> str:
         sign = 1 if claim.relation == ">=" else -1
         certain = "yes" if sign * np.mean(margin) >= 0 else "no"
         doubt = "" if min(sign * low, sign * high) > 0 or max(sign * low, sign * high) < 0 else ", within the noise"
-        told = f"{np.mean(left):.4g} {claim.relation} {claim.factor:g} x {np.mean(right):.4g}"
+        doubt = doubt if count > 1 else ", one seed"
+        told = f"{np.mean(left[:count]):.4g} {claim.relation} {claim.factor:g} x {np.mean(right[:count]):.4g}"
         rows.append([claim.text, claim.source, told, f"margin [{low:+.3g}, {high:+.3g}], {count} seeds", certain + doubt])
     return _markdown(rows) if len(rows) > 2 else ""
 

@@ -2,7 +2,8 @@
 
 Three rollouts of the same test episodes (method notes, section 7): types from each episode's own demonstration (paired), from
 another episode's (shuffled), from the prior. Paired to shuffled is conditional shift, shuffled to prior is marginal shift. The
-expert, and expert against expert at the same size, stand beside them: the ceiling, and the floor of every divergence.
+expert, and expert against expert, stand beside them: the ceiling, and the floor of every divergence. Experts drive each episode
+once; where an agent drives it several times, the floor of its divergence is lower, by what `metrics.jsd` says of sizes.
 """
 
 import argparse
@@ -51,7 +52,12 @@ def donors(method: Method, test: Demonstration) -> Donors:
     """What types are inferred from: an episode's own demonstration, or that of another; nothing where no type is inferred."""
     if not method.encodes:
         return {}
-    return {"paired": test.trajectory, "shuffled": jax.tree.map(lambda x: jnp.roll(x, 1, axis=0), test.trajectory)}
+    return {"paired": test.trajectory, "shuffled": elsewhere(test.trajectory)}
+
+
+def elsewhere(held: Any) -> Any:
+    """Of each episode another one's: from half the set away, since neighbours may be of one recording."""
+    return jax.tree.map(lambda x: jnp.roll(x, len(x) // 2, axis=0), held)
 
 
 def roller(learner: Learner, samples: int, watch: Watch = iter) -> Roll:

@@ -52,7 +52,7 @@ def rollouts(run: Run, episodes: int, types: int, seed_index: int) -> tuple[Demo
         g = SOURCES[learner.method.test_types](agent, demonstration, draw).agent_type
         return learner.play(agent, demonstration.episode, g, noise)
 
-    keys = random.split(stream("evaluation", 0), (min(episodes, config.experts.test), types))
+    keys = random.split(stream("evaluation", 0), (len(jax.tree.leaves(shown)[0]), types))
     inner = jax.vmap(play, in_axes=(None, 0))
     return shown, jax.device_get(jax.jit(jax.vmap(inner))(dataset.without_truth(shown), keys))
 

@@ -112,7 +112,9 @@ def write(scene: str, runs: Mapping[str, Run], out: Path) -> str:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs or goes on with a study."""
-    parser = cli.Parser(prog="python -m rtc_mjx.study", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = cli.Parser(
+        prog="python -m rtc_mjx.study", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
     parser.add_argument("--scene", required=True, metavar="NAME", help="the scene")
     parser.add_argument("--methods", metavar="A,B", help="methods, separated by commas (default: all that run on the scene)")
     parser.add_argument("--seeds", type=int, default=20, metavar="N", help="seeds of each entry, trained in one program (default: 20)")
@@ -122,6 +124,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     options, rest = parser.parse_known_args(argv)
     scene_type(options.scene)
     chosen = [method_name(name) for name in options.methods.split(",")] if options.methods else on_scene(options.scene, rest)
+    if options.ablations and VARIED not in chosen:
+        chosen.append(VARIED)  # what variations are compared with
     cache.keep_compiled()
     folder, out = (options.runs or Path("runs/study")) / options.scene, options.results / options.scene
     wanted = entries(options.scene, chosen, options.ablations, ["--seeds", str(options.seeds), *rest])

@@ -35,6 +35,7 @@ def train(config: Config) -> Run:
         KeyboardInterrupt: interrupted; a checkpoint was saved first.
     """
     config = settings.check(config)
+    config.scene.ready()
     run = Run.open(config.folder) if config.resume else Run.create(config)
     with run.lock():
         learn(run, config)

@@ -81,11 +81,14 @@ def analyse(run: Run, episodes: int, experts: int) -> dict[str, Any]:
         experts: of each episode, and rollouts, that conditional realism compares.
     """
     setup = set_up(run, episodes)
+    count = len(jax.tree.leaves(setup.test)[0])
+    if count < LEAST_EPISODES:
+        raise UsageError(f"{run.folder}: its scene has {count} test episodes; at least {LEAST_EPISODES} are needed")
     out: dict[str, Any] = {
         "scene": setup.config.scene.name,
         "method": setup.config.method,
         "seeds": setup.config.seeds,
-        "episodes": episodes,
+        "episodes": count,
         "update": setup.update,
     }
     if setup.config.scene.redrivable:
@@ -136,8 +139,8 @@ def told_by_types(setup: Setup) -> dict[str, dict[str, Any]]:
 def reencoding(setup: Setup) -> dict[str, list[float]]:
     """Bits by which a trajectory tells its type from the prior's others, per seed.
 
-    E log2 e(g|tau) / p(g) of the demonstration that g was inferred from, of the rollout under g in its episode, and of one under g in
-    another episode. What a type means is kept where the last two come near the first.
+    The median of log2 e(g|tau) / p(g) of the demonstration that g was inferred from, of the rollout under g in its episode, and of one
+    under g in another episode. What a type means is kept where the last two come near the first.
     """
 
     def one(networks: Networks, mine: Demonstration, elsewhere: Demonstration, key: Array) -> dict[str, Array]:
@@ -155,7 +158,7 @@ def reencoding(setup: Setup) -> dict[str, list[float]]:
         }
 
     test = setup.test
-    other = jax.tree.map(lambda x: jnp.roll(x, 1, axis=0), test)
+    other = evaluate.elsewhere(test)
     keys = random.split(stream("type shift", 2), len(jax.tree.leaves(test)[0]))
     run = jax.jit(
         lambda networks: lax.map(
@@ -182,7 +185,7 @@ def realism(setup: Setup, episodes: int, experts: int) -> dict[str, Any]:
 
 
 def compared(ours: np.ndarray, theirs: np.ndarray) -> dict[str, Any]:
-    """One feature of rollouts (seeds, rollouts, episodes) and of twice as many experts (episodes, experts): `agent` and `floor`.
+    """One feature of rollouts (seeds, rollouts, episodes, ...) and of twice as many experts (episodes, experts, ...): `agent` and `floor`.
 
     The bins span what both do: experts may all do the same.
     """
@@ -190,7 +193,7 @@ def compared(ours: np.ndarray, theirs: np.ndarray) -> dict[str, Any]:
     first, second = theirs[:, :count], theirs[:, count:]
     both = np.concatenate([np.ravel(x).astype(float) for x in (theirs, ours)])
     mean = functools.partial(_mean_jsd, limits=(both.min(), max(both.max(), both.min() + 1e-6)))
-    return {"agent": [mean(of_seed.T, first) for of_seed in ours], "floor": mean(second, first)}
+    return {"agent": [mean(of_seed.swapaxes(0, 1), first) for of_seed in ours], "floor": mean(second, first)}
 
 
 def _described(scene: Scene, held: Demonstration, others: Demonstration) -> dict[str, Array]:
@@ -275,7 +278,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--experts", type=int, default=32, metavar="M", help="experts, and rollouts, of an episode in conditional realism")
     options = parser.parse_args(argv)
     run = Run.open(options.run)
-    episodes = options.episodes or run.config.experts.test
+    episodes = run.config.experts.test if options.episodes is None else options.episodes
     if episodes < LEAST_EPISODES:
         raise UsageError(f"--episodes {episodes}: at least {LEAST_EPISODES} are needed")
     if options.experts < 2:

@@ -93,8 +93,17 @@ def test_parts_share_no_recording_and_leave_none_out():
     scene = made("womd")
     parts = {part: part_of(scene.converted, part, scene.train_share) for part in ("train", "test")}
     recorded = {part: {held.name.rsplit("/", 1)[0] for held in held} for part, held in parts.items()}
-    assert not recorded["train"] & recorded["test"] and len(recorded["train"]) == 6 and len(recorded["test"]) == 3
+    assert recorded["train"] and recorded["test"] and not recorded["train"] & recorded["test"]
+    fewer = part_of(scene.converted[len(scene.converted) // 2 :], "train", scene.train_share)
+    assert {held.name for held in fewer} <= {held.name for held in parts["train"]}  # no recording changes its part for others
     assert sum(len(held) for held in parts.values()) == len(scene.converted)
+
+
+def test_recordings_that_are_not_there_leave_no_run_behind(tmp_path):
+    argv = ["--scene", "womd", "--scene.data", str(tmp_path / "none"), "--method", "bc", "--run", str(tmp_path / "run")]
+    with pytest.raises(UsageError, match="no such file"):
+        train.main(argv)
+    assert not (tmp_path / "run").exists()
 
 
 def test_recorded_scenes_say_what_they_cannot_do(tmp_path):

@@ -1,14 +1,17 @@
 """The study: probes, claims and comparisons by hand, studies that are stopped and go on, the analysis of types end to end."""
 
+import functools
 import json
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 from learning import SCENE
 
-from rtc_mjx import claims, evaluate, study, train, type_shift
+from rtc_mjx import claims, dataset, evaluate, study, train, type_shift
 from rtc_mjx.errors import UsageError
+from rtc_mjx.methods import METHODS
 from rtc_mjx.probe import ProbeOptions, information
 from rtc_mjx.scenes import SCENES
 
@@ -63,10 +66,24 @@ def test_claims_say_what_was_measured_and_whether_it_holds(tmp_path):
     assert claims.claims("roundabout", runs) == ""
 
 
+@functools.cache
+def metrics_of(name):
+    """Names of a scene's metrics, from features of the right shapes."""
+    scene = SCENES[name]()
+
+    def one(key):
+        held = dataset.demonstrate(scene, key)
+        return scene.features(held, held.trajectory)
+
+    features = {k: np.zeros((4, *x.shape), x.dtype) for k, x in jax.eval_shape(one, jax.random.key(0)).items()}
+    return set(scene.metrics({k: x[None] for k, x in features.items()}, features))
+
+
 def test_every_claim_names_metrics_that_its_scene_has():
     for claim in claims.CLAIMS:
         assert claim.scene in SCENES and claim.relation in ("<=", ">=")
-        assert {claim.left[1], claim.right[1]} <= {"prior", "paired", "shuffled"}
+        for method, source, metric in (claim.left, claim.right):
+            assert method in METHODS and source in ("prior", "paired", "shuffled") and metric in metrics_of(claim.scene)
 
 
 def test_seeds_are_compared_in_pairs(tmp_path):
@@ -132,6 +149,8 @@ def test_conditional_realism_by_hand():
     assert type_shift.compared(ours, theirs) == {"agent": [0.0, 0.5], "floor": 0.0}
     alike = type_shift.compared(np.zeros((1, 2, 2)), np.ones((2, 4)))  # experts who all do the same tell one who does not
     assert alike == {"agent": [1.0], "floor": 0.0}
+    along = type_shift.compared(np.zeros((1, 2, 3, 5)), np.zeros((3, 4, 5)))  # a feature with a value at each of five times
+    assert along == {"agent": [0.0], "floor": 0.0}
 
 
 @pytest.mark.parametrize("method", ["rtc_d", "bc"])

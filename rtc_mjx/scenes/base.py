@@ -145,6 +145,10 @@ class Scene(abc.ABC):
         """So many of the recorded episodes of a part (all, if there are fewer), with a leading axis; None where episodes are drawn."""
         return None
 
+    def ready(self) -> None:
+        """Gets what a training needs from outside, so that what is wrong with it is said before anything is written."""
+        return
+
     @abc.abstractmethod
     def reset(self, key: jax.Array) -> Episode:
         """Draws s_0 and xi."""

@@ -138,16 +138,6 @@ class Driving(Scene):
         place = jnp.where(road.present[times][..., None], place / FAR, 0.0)
         return jnp.concatenate([jnp.ravel(lights == RED), jnp.ravel(lights == GREEN), jnp.ravel(place), jnp.ravel(road.present[times])])
 
-    def flipped(self, episode: Episode) -> Episode | None:
-        """Red lights are green, green and amber ones are red."""
-
-        def turned(signals: Array) -> Array:
-            return jnp.where(signals == RED, GREEN, jnp.where((signals == GREEN) | (signals == AMBER), RED, signals))
-
-        road = episode.context
-        routes = dataclasses.replace(road.routes, signals=turned(road.routes.signals))
-        return dataclasses.replace(episode, context=dataclasses.replace(road, signals=turned(road.signals), routes=routes))
-
     def ranges(self, expert: dict[str, np.ndarray]) -> dict[str, list[float]]:
         """Of the curvature where lanes branch, 1/m, and of progress, m."""
         return {"curvature": list(span(_on_branches(expert))), "progress": list(span(expert["progress"]))}

@@ -4,6 +4,7 @@ External, xi: when the light changes, who comes from where, whether a car in fro
 its route, speed, headway, how large a gap it takes and how late it looks (`rtc_mjx.scenes.driver`). The agent comes from the south.
 """
 
+import dataclasses
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -18,6 +19,7 @@ from rtc_mjx.scenes.driving import CAR
 from rtc_mjx.scenes.generated import Generated, Others, assemble, moving
 from rtc_mjx.scenes.roads import POINTS, arc, ring_edges, straight, thinned
 from rtc_mjx.scenes.traffic import Drivers, Walkers, drive, walk
+from rtc_mjx.trajectory import Episode
 
 LANE_WIDTH = (3.3, 3.8)  # m
 CORNER = (7.0, 11.0)  # m, radius of a kerb
@@ -45,6 +47,16 @@ class Intersection(Generated):
 
     name: ClassVar[str] = "intersection"
     speeds: ClassVar[tuple[float, float]] = SPEED
+
+    def flipped(self, episode: Episode) -> Episode:
+        """Red lights are green, green and amber ones are red."""
+
+        def turned(signals: Array) -> Array:
+            return jnp.where(signals == RED, GREEN, jnp.where((signals == GREEN) | (signals == AMBER), RED, signals))
+
+        road = episode.context
+        routes = dataclasses.replace(road.routes, signals=turned(road.routes.signals))
+        return dataclasses.replace(episode, context=dataclasses.replace(road, signals=turned(road.signals), routes=routes))
 
     def log(self, key: jax.Array) -> LoggedScene:
         """Road, signals, traffic; the agent itself at t = 0 only."""

@@ -3,8 +3,8 @@
 files -> logged scenes (`rtc_mjx.logs.store`) -> controls under which the MJX car follows each agent (`rtc_mjx.inverse_dynamics`)
       -> two parts, by recording, to learn from and to test on -> episodes whose expert replays its controls
 
-There is one expert to an episode: what else might have been done in it is not known. Agents that no car can follow are counted, and left
-out of what is learned from and tested on.
+There is one expert to an episode: what else might have been done in it is not known. Agents that no car can follow, or whose log ends
+early, are counted, and left out of what is learned from and tested on.
 """
 
 import dataclasses
@@ -13,7 +13,7 @@ import hashlib
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from rtc_mjx import inverse_dynamics
 from rtc_mjx.errors import UsageError
 from rtc_mjx.inverse_dynamics import Fit
-from rtc_mjx.logs import LoggedScene
+from rtc_mjx.logs import RATE, LoggedScene
 from rtc_mjx.logs.convert import Control, Converted, Options
 from rtc_mjx.logs.store import scenes
 from rtc_mjx.pytree import in_parts, pytree
@@ -34,7 +34,7 @@ from rtc_mjx.trajectory import Episode
 
 Part = Literal["train", "test"]
 FOLLOWED, HEADED = 0.5, 0.25  # m and rad, mean errors of position and heading up to which a car follows its log
-KEPT_ROAD_USERS = 24  # of a converted scene; of these, those nearest to the agent have bodies
+KEPT_ROAD_USERS = 24  # of a converted scene, at least; of these, those nearest to the agent have bodies
 
 
 @pytree
@@ -97,7 +97,8 @@ class Recorded(Driving):
             raise UsageError("--scene.data: say where the recordings are: a file, a folder or a glob")
         if self.steps > 30:
             raise UsageError(f"--scene.steps {self.steps}: recorded scenes last 9 s, at most 30 steps")
-        options = Options(control=self.control, start=self.start, road_users=KEPT_ROAD_USERS, lanes=96, points=24, edges=512)
+        most = max(KEPT_ROAD_USERS, self.road_users + 1)
+        options = Options(control=self.control, start=self.start, road_users=most, lanes=96, points=24, edges=512)
         return tuple(scenes([self.data], options))
 
     @property
@@ -115,6 +116,15 @@ class Recorded(Driving):
         """Which recording does not know its lanes' connections."""
         first = next(held for held in self.converted if held.connectivity != "logged")
         return f"has no labels: recording {_scenario(first)} does not log which lane connects to which (it is {first.connectivity})"
+
+    def ready(self) -> None:
+        """Reads the recordings.
+
+        Raises:
+            UsageError: something is wrong with them.
+        """
+        for part in get_args(Part):
+            self.pool(part)
 
     def pool(self, part: Part) -> Pool:
         """The scenes of one part.
@@ -147,7 +157,7 @@ class Recorded(Driving):
         """The episode of a logged scene, with what its driver did; the car starts turning as it was logged."""
         episode = self.episode(log)
         road = RecordedRoad(**{f.name: getattr(episode.context, f.name) for f in dataclasses.fields(Road)}, actions=actions)
-        start = inverse_dynamics.start_of(*self.driven(log), CONTROL_EVERY / 10)
+        start = inverse_dynamics.start_of(*self.driven(log), CONTROL_EVERY / RATE)
         start = dataclasses.replace(start, warmstart=episode.start.warmstart)
         return dataclasses.replace(episode, start=start, context=road)
 
@@ -160,9 +170,6 @@ class Recorded(Driving):
         """The logged driver, who does what was done."""
         return Actor((), lambda memory, observation, action: (memory, action), episode.context.actions), ()
 
-    def flipped(self, episode: Episode) -> None:
-        """Nobody knows what the logged drivers would have done at another light."""
-
     def metrics(self, features: dict[str, np.ndarray], expert: dict[str, np.ndarray]) -> dict[str, float]:
         """Those of driving; the curvature JSD only where lane connectivity was logged."""
         held = super().metrics(features, expert)
@@ -173,7 +180,7 @@ class Recorded(Driving):
         left_out = sum(len(self.pool(part).left_out) for part in ("train", "test"))
         unknown = 0 if self.connected else sum(held.connectivity != "logged" for held in self.converted)
         return super().notes(episodes) | {
-            "agents that no car can follow (left out)": left_out,
+            "agents that no car can follow, or whose log ends early (left out)": left_out,
             "scenes whose lanes are not logged as connected (no curvature_jsd, no Symphony)": unknown,
         }
 
@@ -183,7 +190,7 @@ def fitted(scene: Recorded, logs: LoggedScene) -> Fit:
 
     def one(log: LoggedScene) -> Fit:
         poses, velocity = scene.driven(log)
-        return inverse_dynamics.fit(inverse_dynamics.start_of(poses, velocity, CONTROL_EVERY / 10), poses, scene.substeps)
+        return inverse_dynamics.fit(inverse_dynamics.start_of(poses, velocity, CONTROL_EVERY / RATE), poses, scene.substeps)
 
     return in_parts(jax.jit(jax.vmap(one)), jax.tree.map(jnp.asarray, logs), inverse_dynamics.AT_ONCE)
 
@@ -202,7 +209,8 @@ def _gathered(scene: Recorded, part: Part) -> Pool:
     logs = jax.tree.map(lambda *x: np.stack(x), *(held.scene for held in chosen))
     fit = fitted(scene, logs)
     error, turned = np.mean(fit.position_error, axis=1), np.mean(fit.heading_error, axis=1)
-    follows = (error <= FOLLOWED) & (turned <= HEADED)
+    throughout = np.array([np.all(held.scene.valid[held.scene.controlled, : scene.logged_times]) for held in chosen])
+    follows = (error <= FOLLOWED) & (turned <= HEADED) & throughout
     left_out = {held.name: float(e) for held, e, good in zip(chosen, error, follows, strict=True) if not good}
     if not np.any(follows):
         raise UsageError(f"{scene.data}: no car can follow any of the {len(chosen)} agents to {part}")
@@ -211,10 +219,12 @@ def _gathered(scene: Recorded, part: Part) -> Pool:
 
 
 def part_of(converted: Sequence[Converted], part: Part, share: float) -> list[Converted]:
-    """The scenes of one part: all of a recording are in the same; which recordings, a hash of their names decides."""
-    scenarios = sorted({_scenario(held) for held in converted}, key=lambda name: hashlib.sha256(name.encode()).digest())
-    train = set(scenarios[: max(1, round(share * len(scenarios)))])
-    return [held for held in converted if (_scenario(held) in train) is (part == "train")]
+    """The scenes of one part: all of a recording are in the same, and a hash of its name decides: other recordings change nothing."""
+
+    def learned_from(name: str) -> bool:
+        return int.from_bytes(hashlib.sha256(name.encode()).digest()[:4]) < share * 2**32
+
+    return [held for held in converted if learned_from(_scenario(held)) is (part == "train")]
 
 
 def _scenario(held: Converted) -> str:
