@@ -219,12 +219,19 @@ def _gathered(scene: Recorded, part: Part) -> Pool:
 
 
 def part_of(converted: Sequence[Converted], part: Part, share: float) -> list[Converted]:
-    """The scenes of one part: all of a recording are in the same, and a hash of its name decides: other recordings change nothing."""
+    """The scenes of one part: all of a recording are in the same, and a hash of its name decides: other recordings change nothing.
 
-    def learned_from(name: str) -> bool:
-        return int.from_bytes(hashlib.sha256(name.encode()).digest()[:4]) < share * 2**32
+    Only where that leaves a part empty, the recording that is nearest to belonging there goes over.
+    """
+    place = {name: _place(name) for name in {_scenario(held) for held in converted}}
+    if len(place) > 1:
+        share = min(max(share, sorted(place.values())[0]), sorted(place.values())[-2])
+    return [held for held in converted if (place[_scenario(held)] <= share) is (part == "train")]
 
-    return [held for held in converted if learned_from(_scenario(held)) is (part == "train")]
+
+def _place(name: str) -> float:
+    """Where in [0, 1) the hash of a name lies."""
+    return int.from_bytes(hashlib.sha256(f"part of {name}".encode()).digest()[:4]) / 2**32
 
 
 def _scenario(held: Converted) -> str:
