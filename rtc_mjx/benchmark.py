@@ -362,7 +362,10 @@ def _physics(console: Console, names: Sequence[str], batches: Sequence[int], rou
         for name in names:
             world = WORLDS[name]()
             for batch, direction in ((b, d) for b in batches for d in DIRECTIONS):
-                progress.update(task, description=f"{name}, batch {batch}, {direction}")
+                told = f"{name}, batch {batch}, {direction}"
+                progress.update(task, description=told)
+                if not console.is_terminal:
+                    sys.stderr.write(f"benchmark: {told}\n")
                 rows += measure(name, world, batch, direction, rounds, variants)
                 progress.advance(task)
     return rows
