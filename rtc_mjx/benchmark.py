@@ -32,6 +32,7 @@ from rtc_mjx import cache, cli, config, dataset, pile_up
 from rtc_mjx.errors import UsageError
 from rtc_mjx.learner import compiled_chunk, start_all
 from rtc_mjx.physics import OneStep, PhysicsState, Surroundings, World, load, rest_state, rest_surroundings, simulate, specialised_step
+from rtc_mjx.physics.car import WHEELBASE
 
 WORLDS: dict[str, Callable[[], World]] = {
     "point_mass": lambda: load("double_goal"),
@@ -47,7 +48,6 @@ UPDATES = 10  # training updates of a timed sample
 STEPS = 32  # physics steps of a rollout
 SAMPLE_SECONDS = 0.05  # how long one timed sample lasts at least
 MEMORY_LIMIT_MB = 6000.0  # rows that would need more are left out, and say so
-WHEELBASE = 2.8  # m, of the bicycle model
 
 Inputs = tuple[PhysicsState, Float[Array, "batch steps controls"], Surroundings]
 Rollout = Callable[[PhysicsState, Array, Surroundings], Array]

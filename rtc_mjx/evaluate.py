@@ -30,12 +30,13 @@ from rtc_mjx.config import Config
 from rtc_mjx.errors import RunError, UsageError
 from rtc_mjx.files import write_whole
 from rtc_mjx.keys import stream
-from rtc_mjx.learner import Learner, start_shapes
+from rtc_mjx.learner import Learner
 from rtc_mjx.methods import Method
 from rtc_mjx.models import Networks
 from rtc_mjx.pytree import in_parts
 from rtc_mjx.runs import Run
 from rtc_mjx.scenes import Recorded, Scene
+from rtc_mjx.trained import trained
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
 AT_ONCE = 2048  # rollouts simulated at once
@@ -124,30 +125,26 @@ def score(config: Config, features: dict[str, Features], expert: Features) -> di
 
 def evaluate(run: Run, episodes: int, watch: Watch = iter) -> dict[str, Any]:
     """All of evaluation.json for a run's last whole checkpoint; `watch` goes through the parts of the work."""
-    config = run.config
-    train = dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN)
+    held = trained(run)
+    config, learner, networks = held.config, held.learner, held.networks
     tests = [dataset.demonstrations(config.scene, episodes, seed) for seed in (dataset.TEST, dataset.SECOND_TEST)]
-    learner = config.learner(dataset.statistics(config.scene, train))
-    update, state, _ = run.restore(start_shapes(learner, config.all_seeds))
     roll, shown = roller(learner, config.scene.samples, watch), dataset.without_truth(tests[0])
     given = donors(learner.method, shown)
-    features = roll(state.networks, shown, given, stream("evaluation", 0))
+    features = roll(networks, shown, given, stream("evaluation", 0))
     expert, second = (expert_features(config.scene, test) for test in tests)
     table = score(config, features, expert)
     means = {source: _summaries(config, features[source], expert, table[source]) for source in table}
     scene = config.scene
-    recorded = (
-        {"sim_agents": challenge(scene, learner, state.networks, episodes, stream("evaluation", 1))} if isinstance(scene, Recorded) else {}
-    )
+    recorded = {"sim_agents": challenge(scene, learner, networks, episodes, stream("evaluation", 1))} if isinstance(scene, Recorded) else {}
     return recorded | {
         "scene": config.scene.name,
         "method": config.method,
         "seeds": config.seeds,
         "episodes": len(next(iter(expert.values()))),
-        "update": update,
+        "update": held.update,
         "metrics": means["prior"],
         "types": means,
-        "reaction": reaction(learner, functools.partial(roll, state.networks), shown, features, expert),
+        "reaction": reaction(learner, functools.partial(roll, networks), shown, features, expert),
         "ranges": config.scene.ranges(expert),
         "notes": {what: count for what, count in config.scene.notes(tests[0].episode).items() if count},
         "reference": {"expert": config.scene.metrics(expert, expert), "expert_vs_expert": config.scene.metrics(second, expert)},

@@ -17,10 +17,9 @@ from jaxtyping import Array, Float
 
 from rtc_mjx.geometry import rotate, wrapped
 from rtc_mjx.physics import PhysicsState, World, control_step, load, rest_state, rest_surroundings, specialised_step
+from rtc_mjx.physics.car import CONTROL_UNIT, WHEELBASE
 from rtc_mjx.pytree import pytree
 
-WHEELBASE = 2.8  # m, of assets/car.xml
-UNIT = (1.5, 0.08)  # m/s^2 and rad: a typical size of the controls, in which the guess is improved
 CATCH_UP, MATCH = 1.0, 1.6  # 1/s^2 and 1/s: how the driver makes up for distance, and for speed
 AHEAD, NEAREST = 0.9, 4.0  # s and m, how far ahead it looks for its way back to the path
 HEADING_ARM = 1.5  # m by which an error in heading counts like one in position
@@ -87,7 +86,7 @@ def fit(start: PhysicsState, poses: Float[Array, "times 3"], substeps: int, opti
 
     def loss(guess: Array) -> Array:
         reached, actions = drive(guess)
-        rough = jnp.diff(actions / jnp.array(UNIT), axis=0)
+        rough = jnp.diff(actions / jnp.array(CONTROL_UNIT), axis=0)
         return jnp.mean(_off(reached, poses)) + options.smoothness * jnp.mean(jnp.sum(rough**2, axis=1))
 
     def update(carry: tuple[Array, optax.OptState, Array, Array], _: None) -> tuple[tuple[Array, optax.OptState, Array, Array], None]:
@@ -98,7 +97,7 @@ def fit(start: PhysicsState, poses: Float[Array, "times 3"], substeps: int, opti
         move, moments = adam.update(jnp.where(jnp.isfinite(slope), slope, 0.0), moments)
         return (guess + move, moments, best, least), None
 
-    first = first_guess(poses, step) / jnp.array(UNIT)
+    first = first_guess(poses, step) / jnp.array(CONTROL_UNIT)
     (_, _, best, _), _ = lax.scan(update, (first, adam.init(first), first, jnp.array(jnp.inf)), length=options.updates)
     reached, actions = drive(best)
     return Fit(actions, jnp.sqrt(jnp.sum((reached - poses)[:, :2] ** 2, axis=1)), jnp.abs(wrapped(reached[:, 2] - poses[:, 2])))
@@ -134,7 +133,7 @@ def follow(start: PhysicsState, poses: Array, substeps: int, guess: Float[Array,
         reach = jnp.maximum(NEAREST, AHEAD * jnp.abs(own[0]))
         back = 2 * WHEELBASE * (off[1] / reach**2 + wrapped(wanted[2] - state.qpos[2]) / reach)
         correction = jnp.stack([CATCH_UP * off[0] + MATCH * (speed - own[0]), jnp.sign(own[0]) * back])
-        action = jnp.clip(pushed * jnp.array(UNIT) + correction, low, high)
+        action = jnp.clip(pushed * jnp.array(CONTROL_UNIT) + correction, low, high)
         state = advance(state, action, rest_surroundings(world))
         return state, (state.qpos[:3], action)
 

@@ -25,10 +25,10 @@ from rtc_mjx.agent_types import SOURCES
 from rtc_mjx.camera import Picture, camera
 from rtc_mjx.errors import UsageError
 from rtc_mjx.keys import stream
-from rtc_mjx.learner import start_shapes
 from rtc_mjx.physics import World, place_surroundings
 from rtc_mjx.runs import Run
 from rtc_mjx.scenes import Scene
+from rtc_mjx.trained import trained
 from rtc_mjx.trajectory import Demonstration, Episode, Trajectory
 
 PALETTE = ((0.93, 0.55, 0.15), (0.26, 0.62, 0.85), (0.62, 0.43, 0.80), (0.90, 0.76, 0.20), (0.42, 0.75, 0.42), (0.88, 0.45, 0.60))
@@ -40,12 +40,11 @@ HOLD = 10  # frames for which the end of an episode stays
 
 def rollouts(run: Run, episodes: int, types: int, seed_index: int) -> tuple[Demonstration, Trajectory]:
     """Test demonstrations, and rollouts of the run's last checkpoint in each under `types` draws of its test types."""
-    config = run.config
-    learner = config.learner(dataset.statistics(config.scene, dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN)))
+    held = trained(run)
+    config, learner = held.config, held.learner
     test = dataset.demonstrations(config.scene, config.experts.test, dataset.TEST)
     shown = jax.tree.map(lambda x: x[:episodes], test)
-    _, state, _ = run.restore(start_shapes(learner, config.all_seeds))
-    agent = learner.agent(jax.tree.map(lambda x: x[seed_index], state.networks))
+    agent = learner.agent(jax.tree.map(lambda x: x[seed_index], held.networks))
 
     def play(demonstration: Demonstration, key: jax.Array) -> Trajectory:
         draw, noise = random.split(key)

@@ -27,15 +27,14 @@ from rich.table import Table
 
 from rtc_mjx import cache, cli, dataset, evaluate, metrics
 from rtc_mjx.agent_types import SOURCES
-from rtc_mjx.config import Config
 from rtc_mjx.errors import UsageError
 from rtc_mjx.files import write_whole
 from rtc_mjx.keys import stream
-from rtc_mjx.learner import Learner, start_shapes
 from rtc_mjx.models import Networks
 from rtc_mjx.probe import information
 from rtc_mjx.runs import Run
 from rtc_mjx.scenes import Scene
+from rtc_mjx.trained import Trained, trained
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
 REALISM_BINS, REALISM_EPISODES = 10, 64
@@ -43,33 +42,22 @@ LEAST_EPISODES = 16  # a probe learns from half of them and is measured on a qua
 
 
 @dataclass(frozen=True)
-class Setup:
-    """A trained run with what its analysis needs.
+class Setup(Trained):
+    """A trained run with the test episodes of its analysis.
 
     Attributes:
-        config: of the run.
-        learner: the same, ready to act.
-        networks: of all seeds.
-        update: at which they stand.
         test: test demonstrations, without the truth.
         truth: the experts' minds.
     """
 
-    config: Config
-    learner: Learner
-    networks: Networks
-    update: int
     test: Demonstration
     truth: Any
 
 
 def set_up(run: Run, episodes: int) -> Setup:
     """Loads the run's last whole checkpoint, and test episodes."""
-    config = run.config
-    learner = config.learner(dataset.statistics(config.scene, dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN)))
-    update, state, _ = run.restore(start_shapes(learner, config.all_seeds))
-    test = dataset.demonstrations(config.scene, episodes, dataset.TEST)
-    return Setup(config, learner, state.networks, update, dataset.without_truth(test), test.truth)
+    test = dataset.demonstrations(run.config.scene, episodes, dataset.TEST)
+    return Setup(**vars(trained(run)), test=dataset.without_truth(test), truth=test.truth)
 
 
 def analyse(run: Run, episodes: int, experts: int) -> dict[str, Any]:

@@ -2,14 +2,16 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from worlds import make
 
-from rtc_mjx.physics import PhysicsState, rest_state, rest_surroundings, simulate
+from rtc_mjx.physics import PhysicsState, assets, rest_state, rest_surroundings, simulate
+from rtc_mjx.physics.car import WHEELBASE
 
 pytestmark = pytest.mark.usefixtures("x64")
-MASS, WHEELBASE, FRICTION, GRAVITY = 1500.0, 2.8, 0.9, 9.81  # of assets/car.xml
+MASS, FRICTION, GRAVITY = 1500.0, 0.9, 9.81  # of assets/car.xml
 
 
 def drive(speed, acceleration, steer, steps):
@@ -19,6 +21,13 @@ def drive(speed, acceleration, steer, steps):
     state = PhysicsState(state.qpos, state.qvel.at[0].set(speed), state.warmstart)
     controls = jnp.tile(jnp.array([acceleration, steer]), (steps, 1))
     return jax.jit(lambda s, u: simulate(world, s, u, rest_surroundings(world))[1])(state, controls)
+
+
+def test_the_wheelbase_is_that_of_the_asset():
+    car = mujoco.MjModel.from_xml_path(str(assets() / "car.xml"))
+    data = mujoco.MjData(car)
+    mujoco.mj_kinematics(car, data)
+    assert np.isclose(data.site("front_axle").xpos[0] - data.site("rear_axle").xpos[0], WHEELBASE)
 
 
 def test_it_runs_straight_without_drift():

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import random
 from jaxtyping import Array, Float
 
+from rtc_mjx.physics.car import WHEELBASE
 from rtc_mjx.scenes.base import Actor, split_items
 from rtc_mjx.scenes.driving import AHEAD, CAR, OWN
 from rtc_mjx.scenes.traffic import COMFORT, GRIP, follow_the_leader
@@ -22,7 +23,6 @@ from rtc_mjx.trajectory import Episode
 if TYPE_CHECKING:
     from rtc_mjx.scenes.driving import Driving
 
-WHEELBASE = 2.8  # m
 REAR = -CAR[0] / 2 + 0.9  # m, the rear axle from the car's centre
 GRID = tuple(1.5 * i for i in range(28))  # m along the route, where others are looked for
 AFTER = tuple(0.4 * i for i in range(13))  # s ahead, to which others are expected to go straight on

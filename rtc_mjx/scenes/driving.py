@@ -23,6 +23,7 @@ from rtc_mjx import metrics
 from rtc_mjx.geometry import boxes_overlap, capsule_gap, closest_approach, corners, off_road, pose_at, project, rotate, wrapped
 from rtc_mjx.logs import AMBER, GREEN, PEDESTRIAN, RATE, RED, LoggedScene, RoadGraph
 from rtc_mjx.physics import PhysicsState, Surroundings, World, load, rest_state, specialised_step, substates
+from rtc_mjx.physics.car import CONTROL_UNIT
 from rtc_mjx.pytree import pytree
 from rtc_mjx.scenes import scenery
 from rtc_mjx.scenes.base import ItemSet, Scene
@@ -105,8 +106,8 @@ class Driving(Scene):
 
     @property
     def control_unit(self) -> Float[np.ndarray, "controls"]:
-        """1.5 m/s^2 and 0.08 rad."""
-        return np.array([1.5, 0.08])
+        """Of drive in m/s^2 and steer in rad."""
+        return np.array(CONTROL_UNIT)
 
     @property
     def labels(self) -> int:
