@@ -330,7 +330,7 @@ def main(argv: Sequence[str] | None = None) -> None:
             raise UsageError(f"{path}: there is no folder {path.absolute().parent}")
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are measured
     rounds = 3 if options.quick else options.rounds
-    console = Console(width=None if sys.stdout.isatty() else 130)
+    console = cli.console()
     report: dict[str, Any] = {"rows": [], "pile_up": {}, "update": [], "warm_first_result_s": {}}
     if "physics" in parts:
         rows = _physics(console, names, batches, rounds, plain=not options.quick)

@@ -5,7 +5,11 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import NoReturn
 
+from rich.console import Console
+
 from rtc_mjx.errors import RunError, UsageError
+
+WIDTH = 160  # characters of a line of a table
 
 
 class Parser(argparse.ArgumentParser):
@@ -14,6 +18,11 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Prints the message and leaves with status 2."""
         self.exit(2, f"{self.prog}: {message} (see --help)\n")
+
+
+def console() -> Console:
+    """Where results are printed: as wide as the terminal, or wide enough for tables where there is none."""
+    return Console(width=None if sys.stdout.isatty() else WIDTH)
 
 
 def run(main: Callable[[Sequence[str] | None], None]) -> None:

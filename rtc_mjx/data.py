@@ -4,6 +4,7 @@ Examples:
   python -m rtc_mjx.data recordings/                        what is in a folder
   python -m rtc_mjx.data 'womd/*.tfrecord-*' --convert      convert and keep all scenes
   python -m rtc_mjx.data scene.json --render pictures/      draw them from above
+  python -m rtc_mjx.data recordings/ --replay               how well the simulated car can follow each agent
 
 Formats, told by content: TFRecords of Waymo Open Motion Dataset Scenario protos or tf.Examples, GPUDrive / Nocturne JSON, ScenarioNet
 pickles (as data only: nothing in them is run).
@@ -17,6 +18,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
@@ -26,8 +30,10 @@ from rtc_mjx.errors import RunError, UsageError
 from rtc_mjx.logs import picture, read, store
 from rtc_mjx.logs.convert import Control, Conversion, Options
 from rtc_mjx.logs.recording import Recording
+from rtc_mjx.scenes.recorded import driven, fitted, follows
 
 KINDS = ("of no kind", "vehicles", "pedestrians", "cyclists", "others")
+CONTROL_STEPS = 30  # of the 9 s of a scene
 EVERY = 200  # recordings between two plain lines of progress
 
 
@@ -136,8 +142,43 @@ class Painter:
         picture.draw(became.scenes[controlled.index(own) if own in controlled else 0], controlled, self.folder / f"{name}{suffix}.png")
 
 
-def look(file: Path, options: Options, keep: bool, paint: Painter, reporter: Reporter) -> Summary:
-    """Reads one file to its end.
+class Replays:
+    """How well the simulated car can follow the controlled agents of all scenes."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+        self.poses: list[Array] = []  # of the agents only: of thousands of scenes that is little
+        self.velocities: list[Array] = []
+        self.throughout: list[bool] = []
+
+    def __call__(self, recording: Recording, became: Conversion | UsageError) -> None:
+        """Notes the agents of one recording."""
+        for held in became.scenes if isinstance(became, Conversion) else ():
+            poses, velocity = driven(held.scene, CONTROL_STEPS)
+            self.names.append(held.name)
+            self.poses.append(poses)
+            self.velocities.append(velocity)
+            self.throughout.append(bool(np.all(held.scene.valid[held.scene.controlled])))
+
+    def tables(self) -> list[Table]:
+        """A row a scene, then a row over all agents that are there throughout."""
+        there = np.array(self.throughout)
+        fit = fitted(jnp.stack(self.poses), jnp.stack(self.velocities))
+        errors = {"position, m": fit.position_error, "heading, rad": fit.heading_error}
+        names = [f"{name} {what}" for name in errors for what in ("mean", "95 %")]
+        columns = [column for error in errors.values() for column in (np.mean(error, axis=1), np.quantile(error, 0.95, axis=1))]
+        each, every = Table("scene", *names, "", title="replay by recovered controls"), Table("scenes", "of", *names, title="all of them")
+        for index, (name, good) in enumerate(zip(self.names, follows(fit), strict=True)):
+            note = "the log ends early" if not there[index] else "" if good else "no car can follow"
+            each.add_row(name, *(f"{column[index]:.3f}" for column in columns), note)
+        for what, share in (("median agent", 0.5), ("95th percentile agent", 0.95)):
+            told = [f"{np.quantile(column[there], share):.3f}" if np.any(there) else "-" for column in columns]
+            every.add_row(f"{np.sum(there):,}", what, *told)
+        return [each, every]
+
+
+def look(file: Path, options: Options, keep: bool, watchers: Sequence[store.Told], reporter: Reporter) -> Summary:
+    """Reads one file to its end; `watchers` see each recording.
 
     Raises:
         UsageError: it cannot be read to its end.
@@ -145,8 +186,8 @@ def look(file: Path, options: Options, keep: bool, paint: Painter, reporter: Rep
     summary = Summary()
 
     def told(recording: Recording, became: Conversion | UsageError) -> None:
-        summary.add(recording, became)
-        paint(recording, became)
+        for watcher in (summary.add, *watchers):
+            watcher(recording, became)
         reporter.recording(file, summary)
 
     if keep:
@@ -166,7 +207,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     asked = _parser().parse_args(argv)
     options = Options(**{name: getattr(asked, name) for name in Options.__dataclass_fields__})
-    found, paint = read.files(asked.paths), Painter(asked.render)
+    found, replays = read.files(asked.paths), Replays()
+    watchers: list[store.Told] = [Painter(asked.render), *([replays] if asked.replay else [])]
     total, kinds, bad = Summary(), Counter[str](), list[UsageError]()
     reporter = Reporter(len(found))
     with reporter.bar:
@@ -176,7 +218,7 @@ def main(argv: Sequence[str] | None = None) -> None:
                 if isinstance(kind, read.Foreign) and kind.certain and not named:
                     reporter.file([f"{file}", f"  left out: {kind.what}, no recording"])
                     continue
-                summary = look(file, options, asked.convert, paint, reporter)
+                summary = look(file, options, asked.convert, watchers, reporter)
             except UsageError as error:
                 bad.append(error)
                 if len(found) > 1:
@@ -186,7 +228,9 @@ def main(argv: Sequence[str] | None = None) -> None:
             total.join(summary)
             reporter.file([f"{file}", *summary.lines(str(kind))])
     if kinds:
-        Console().print(_table(kinds, total))
+        cli.console().print(_table(kinds, total))
+    for table in replays.tables() if replays.names else ():
+        cli.console().print(table)
     _finish(bad, kinds, len(found), total.counts["scenes"] if asked.convert else 1)
 
 
@@ -224,6 +268,7 @@ def _parser() -> cli.Parser:
     parser.add_argument("paths", nargs="+", metavar="PATH", help="files, folders or globs")
     parser.add_argument("--convert", action="store_true", help="keep the converted scenes in the cache")
     parser.add_argument("--render", type=Path, metavar="DIR", help="draw one scene of each recording from above, as PNG")
+    parser.add_argument("--replay", action="store_true", help="recover the controls of each agent; say how far the car is off its log")
     scenes = parser.add_argument_group("which scenes")
     who = "of the self-driving car (sdc), of tracks_to_predict (predict), of every vehicle there throughout that moves (moving, default)"
     scenes.add_argument("--control", choices=get_args(Control), default=known.control, help=who)

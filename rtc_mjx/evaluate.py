@@ -33,6 +33,7 @@ from rtc_mjx.keys import stream
 from rtc_mjx.learner import Learner
 from rtc_mjx.methods import Method
 from rtc_mjx.models import Networks
+from rtc_mjx.provenance import made_by
 from rtc_mjx.pytree import in_parts
 from rtc_mjx.runs import Run
 from rtc_mjx.scenes import Recorded, Scene
@@ -116,11 +117,16 @@ def score(config: Config, features: dict[str, Features], expert: Features) -> di
     """
     out: dict[str, dict[str, list[float]]] = {}
     for source, arrays in features.items():
-        if not np.all(arrays[FINITE]):
-            raise RunError(f"{int(np.sum(~arrays[FINITE]))} of {arrays[FINITE].size} test rollouts under {source} types are not finite")
+        check_finite(arrays[FINITE], source)
         rows = [config.scene.metrics({k: v[i] for k, v in arrays.items()}, expert) for i in range(config.seeds)]
         out[source] = {name: [row[name] for row in rows] for name in rows[0]}
     return out
+
+
+def check_finite(finite: np.ndarray, source: str) -> None:
+    """Raises RunError unless all rollouts under types of a source are finite."""
+    if not np.all(finite):
+        raise RunError(f"{int(np.sum(~finite))} of {finite.size} test rollouts under {source} types are not finite")
 
 
 def evaluate(run: Run, episodes: int, watch: Watch = iter) -> dict[str, Any]:
@@ -136,19 +142,24 @@ def evaluate(run: Run, episodes: int, watch: Watch = iter) -> dict[str, Any]:
     means = {source: _summaries(config, features[source], expert, table[source]) for source in table}
     scene = config.scene
     recorded = {"sim_agents": challenge(scene, learner, networks, episodes, stream("evaluation", 1))} if isinstance(scene, Recorded) else {}
-    return recorded | {
-        "scene": config.scene.name,
-        "method": config.method,
-        "seeds": config.seeds,
-        "episodes": len(next(iter(expert.values()))),
-        "update": held.update,
-        "metrics": means["prior"],
-        "types": means,
-        "reaction": reaction(learner, functools.partial(roll, networks), shown, features, expert),
-        "ranges": config.scene.ranges(expert),
-        "notes": {what: count for what, count in config.scene.notes(tests[0].episode).items() if count},
-        "reference": {"expert": config.scene.metrics(expert, expert), "expert_vs_expert": config.scene.metrics(second, expert)},
-    }
+    return (
+        recorded
+        | made_by()
+        | {
+            "scene": config.scene.name,
+            "method": config.method,
+            "seeds": config.seeds,
+            "episodes": len(next(iter(expert.values()))),
+            "asked": episodes,
+            "update": held.update,
+            "metrics": means["prior"],
+            "types": means,
+            "reaction": reaction(learner, functools.partial(roll, networks), shown, features, expert),
+            "ranges": config.scene.ranges(expert),
+            "notes": {what: count for what, count in config.scene.notes(tests[0].episode).items() if count},
+            "reference": {"expert": config.scene.metrics(expert, expert), "expert_vs_expert": config.scene.metrics(second, expert)},
+        }
+    )
 
 
 def reaction(
@@ -220,6 +231,20 @@ def likeness(figures: dict[str, Any]) -> Table:
     return out
 
 
+def progress(what: str) -> Watch:
+    """A progress bar on a terminal's standard error; elsewhere it says on it when a tenth more is done."""
+    if sys.stderr.isatty():
+        return functools.partial(rich.progress.track, description=what, console=Console(stderr=True))
+
+    def lines(parts: Sequence[Any]) -> Iterable[Any]:
+        for number, part in enumerate(parts, 1):
+            yield part
+            if number * 10 // len(parts) > (number - 1) * 10 // len(parts):
+                sys.stderr.write(f"{what} {number}/{len(parts)}\n")
+
+    return lines
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     """Evaluates a run."""
     parser = cli.Parser(prog="python -m rtc_mjx.evaluate", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -230,9 +255,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         raise UsageError(f"--episodes {options.episodes}: at least 4 are needed")
     cache.keep_compiled()
     run = Run.open(options.run)
-    bar = functools.partial(rich.progress.track, description="rollouts", console=Console(stderr=True), disable=not sys.stderr.isatty())
-    result = evaluate(run, options.episodes or run.config.experts.test, bar)
-    console = Console(width=None if Console().is_terminal else 140)
+    result = evaluate(run, options.episodes or run.config.experts.test, progress("rollouts"))
+    console = cli.console()
     console.print(table(result))
     if "sim_agents" in result:
         console.print(likeness(result["sim_agents"]))

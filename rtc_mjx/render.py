@@ -198,7 +198,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     rate = 1 / (run.config.scene.substeps * run.config.scene.world.timestep)
     total = len(tracks.actions) * (run.config.scene.steps + HOLD)
     count = write(pictures(run, shown, tracks, view, size), out, whole, rate, total)
-    Console().print(f"{out}: {count} frames of {len(tracks.actions)} episodes")
+    cli.console().print(f"{out}: {count} frames of {len(tracks.actions)} episodes")
 
 
 def full_name(scene: Scene, wanted: str) -> str:

@@ -1,27 +1,23 @@
 """Tables and figures of runs side by side: learning curves (mean and standard deviation over seeds) and the last evaluation.
 
 `python -m rtc_mjx.report RUN... --out DIR` writes curves.png, table.md and results in one JSON file a method: evaluation.json with the
-settings, and the versions and the commit of the code that reports.
+settings.
 """
 
 import argparse
 import json
-import subprocess
 from collections.abc import Mapping, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.markdown import Markdown
 
-from rtc_mjx import __version__, cli
+from rtc_mjx import cli
 from rtc_mjx import config as settings
 from rtc_mjx.errors import UsageError
 from rtc_mjx.runs import Run
 
-PACKAGES = ("mujoco", "mujoco-mjx", "jax", "flax", "optax")
 LOSSES = ("reconstruction", "cloning", "adversarial", "type_kl", "accuracy_expert", "accuracy_policy")
 
 
@@ -38,7 +34,7 @@ def evaluation(run: Run) -> dict[str, Any]:
         held = json.loads(file.read_text())
     except ValueError as error:
         raise UsageError(f"{file} is damaged: {error}") from error
-    if not isinstance(held, dict) or not {"metrics", "types", "reference", "update", "seeds", "episodes"} <= set(held):
+    if not isinstance(held, dict) or not {"metrics", "types", "reference", "update", "seeds", "episodes", "asked", "commit"} <= set(held):
         raise UsageError(f"{file} is of another version; make it again with: python -m rtc_mjx.evaluate --run {run.folder}")
     return held
 
@@ -112,19 +108,7 @@ def curves(runs: Sequence[Run], file: Path) -> None:
 
 def record(run: Run) -> dict[str, Any]:
     """The evaluation with all that is needed to make it again."""
-    versions = {"python_package": __version__, **{name: metadata.version(name) for name in PACKAGES}}
-    return {**evaluation(run), "config": settings.to_dict(run.config), "versions": versions, "commit": _commit()}
-
-
-def _commit() -> str | None:
-    """The commit of the checkout that this code runs from; None where there is none."""
-    try:
-        done = subprocess.run(
-            ["git", "describe", "--always", "--dirty"], cwd=Path(__file__).parent, capture_output=True, text=True, check=True
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return done.stdout.strip()
+    return {**evaluation(run), "config": settings.to_dict(run.config)}
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -150,7 +134,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     curves(runs, options.out / "curves.png")
     for held in records:
         (options.out / f"{held['method']}.json").write_text(json.dumps(held, indent=1) + "\n")
-    Console().print(Markdown(text))
+    cli.console().print(Markdown(text))
 
 
 if __name__ == "__main__":

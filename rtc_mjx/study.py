@@ -9,6 +9,7 @@ was, and ends with the numbers of one that was never stopped.
 import argparse
 import json
 import shutil
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,12 +19,13 @@ from rich.console import Console
 from rich.markdown import Markdown
 
 from rtc_mjx import cache, claims, cli, config, evaluate, report, train
-from rtc_mjx.errors import UsageError
+from rtc_mjx.errors import RunError, UsageError
 from rtc_mjx.files import write_whole
 from rtc_mjx.methods import METHODS, method_name
 from rtc_mjx.runs import Run
 from rtc_mjx.scenes import scene_type
 
+COMMAND = "python -m rtc_mjx.study"
 VARIED = "rtc_c"  # the method whose parts are varied
 VARIATIONS: Mapping[str, tuple[Any, ...]] = {  # option -> values beside the committed one
     "encoder-share": (0.125, 0.25, 0.5, 0.75),
@@ -33,6 +35,9 @@ VARIATIONS: Mapping[str, tuple[Any, ...]] = {  # option -> values beside the com
     "losses.kl-direction": ("prior_posterior",),
     "optimiser.gradient": ("dynamics_only", "none"),
 }
+
+
+TABLES = ("table", "comparisons", "claims", "ablations")
 
 
 @dataclass(frozen=True)
@@ -54,7 +59,7 @@ def entries(scene: str, methods: Sequence[str], ablate: bool, options: Sequence[
     """What a study trains: the methods, then, if wanted, the variations of RTC's parts."""
     held = [Entry(name, name, tuple(options)) for name in methods]
     if ablate:
-        committed = config.flat(config.to_dict(config.defaults(scene, VARIED)))
+        committed = config.flat(config.to_dict(config.from_command_line(["--scene", scene, "--method", VARIED, *options], COMMAND)))
         for option, values in VARIATIONS.items():
             others = [v for v in values if v != committed[option.replace("-", "_")]]
             held += [Entry(f"{VARIED},{option}={v}", VARIED, (*options, f"--{option}", str(v))) for v in others]
@@ -63,7 +68,7 @@ def entries(scene: str, methods: Sequence[str], ablate: bool, options: Sequence[
 
 def on_scene(scene: str, options: Sequence[str]) -> list[str]:
     """The methods that can run on a scene with these options."""
-    held = config.from_command_line(["--scene", scene, "--method", "bc", *options], "python -m rtc_mjx.study").scene
+    held = config.from_command_line(["--scene", scene, "--method", "bc", *options], COMMAND).scene
     return [name for name, method in METHODS.items() if method.kind != "label" or held.labels]
 
 
@@ -75,7 +80,7 @@ def complete(entry: Entry, scene: str, folder: Path) -> Run:
         shutil.rmtree(folder)  # stopped before it was begun
     again = ["--resume"] if folder.is_dir() else []
     argv = ["--scene", scene, "--method", entry.method, "--run", str(folder), *entry.options, *again]
-    settings = config.from_command_line(argv, "python -m rtc_mjx.study")
+    settings = config.from_command_line(argv, COMMAND)
     run = Run.open(folder) if again else None
     if run is None or settings.updates not in run.checkpoints():
         run = train.train(settings)
@@ -84,11 +89,27 @@ def complete(entry: Entry, scene: str, folder: Path) -> Run:
     return run
 
 
+def whole_or_small(scene: str, methods: Sequence[str], folder: Path, small: Sequence[str]) -> dict[str, Run]:
+    """The finished runs in a folder by method; where one is missing, small ones of all, trained here in a new folder.
+
+    Args:
+        scene: of the runs.
+        methods: their names.
+        folder: where a study keeps its runs of the scene.
+        small: options of the small trainings.
+    """
+    if not all((folder / name / "evaluation.json").is_file() for name in methods):
+        folder = Path(tempfile.mkdtemp())
+        return {name: complete(Entry(name, name, tuple(small)), scene, folder / name) for name in methods}
+    return {name: Run.open(folder / name) for name in methods}
+
+
 def _evaluated(run: Run) -> bool:
-    """Whether the evaluation is that of the last update."""
+    """Whether the evaluation is that of the last update, on all test episodes of the settings."""
     if not (run.folder / "evaluation.json").is_file():
         return False
-    return bool(report.evaluation(run)["update"] == run.config.updates)
+    held = report.evaluation(run)
+    return bool(held["update"] == run.config.updates and held["asked"] == run.config.experts.test)
 
 
 def write(scene: str, runs: Mapping[str, Run], out: Path) -> str:
@@ -96,15 +117,17 @@ def write(scene: str, runs: Mapping[str, Run], out: Path) -> str:
     methods = {name: run for name, run in runs.items() if name == run.config.method}
     varied = {name: run for name, run in runs.items() if name not in methods}
     out.mkdir(parents=True, exist_ok=True)
-    parts = {}
+    parts = dict.fromkeys(TABLES, "")
     if methods:
         report.curves(list(methods.values()), out / "curves.png")
-        parts = {"table": report.table(methods), "comparisons": claims.comparisons(methods), "claims": claims.claims(scene, methods)}
+        parts |= {"table": report.table(methods), "comparisons": claims.comparisons(methods), "claims": claims.claims(scene, methods)}
     if varied:
         parts["ablations"] = report.table({name: run for name, run in runs.items() if name == VARIED or name in varied})
     for name, part in parts.items():
         if part:
             write_whole(out / f"{name}.md", part)
+        else:
+            (out / f"{name}.md").unlink(missing_ok=True)  # of other runs
     for name, run in runs.items():
         write_whole(out / f"{name}.json", json.dumps(report.record(run), indent=1) + "\n")
     return "\n".join(part for part in parts.values() if part)
@@ -112,9 +135,7 @@ def write(scene: str, runs: Mapping[str, Run], out: Path) -> str:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs or goes on with a study."""
-    parser = cli.Parser(
-        prog="python -m rtc_mjx.study", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
+    parser = cli.Parser(prog=COMMAND, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
     parser.add_argument("--scene", required=True, metavar="NAME", help="the scene")
     parser.add_argument("--methods", metavar="A,B", help="methods, separated by commas (default: all that run on the scene)")
     parser.add_argument("--seeds", type=int, default=20, metavar="N", help="seeds of each entry, trained in one program (default: 20)")
@@ -130,11 +151,20 @@ def main(argv: Sequence[str] | None = None) -> None:
     folder, out = (options.runs or Path("runs/study")) / options.scene, options.results / options.scene
     wanted = entries(options.scene, chosen, options.ablations, ["--seeds", str(options.seeds), *rest])
     runs: dict[str, Run] = {}
+    failed: dict[str, RunError] = {}
+    text = ""
     for number, entry in enumerate(wanted, 1):
         Console(stderr=True).print(f"[{number}/{len(wanted)}] {entry.name}", markup=False)
-        runs[entry.name] = complete(entry, options.scene, folder / entry.name)
+        try:
+            runs[entry.name] = complete(entry, options.scene, folder / entry.name)
+        except RunError as error:  # such as a seed that diverged: the other entries do not depend on it
+            failed[entry.name] = error
+            Console(stderr=True).print(f"{entry.name}: {error}", markup=False)
+            continue
         text = write(options.scene, runs, out)  # after each: a study that is stopped leaves what it has
-    Console().print(Markdown(text))
+    cli.console().print(Markdown(text))
+    if failed:
+        raise RunError("; ".join(f"{name} failed: {error}" for name, error in failed.items()))
 
 
 if __name__ == "__main__":

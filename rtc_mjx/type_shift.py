@@ -12,7 +12,7 @@ Everything is in bits, rates or the scene's own units, per seed of the run.
 import argparse
 import functools
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax, random
 from jaxtyping import Array
-from rich.console import Console
 from rich.table import Table
 
 from rtc_mjx import cache, cli, dataset, evaluate, metrics
@@ -60,13 +59,14 @@ def set_up(run: Run, episodes: int) -> Setup:
     return Setup(**vars(trained(run)), test=dataset.without_truth(test), truth=test.truth)
 
 
-def analyse(run: Run, episodes: int, experts: int) -> dict[str, Any]:
+def analyse(run: Run, episodes: int, experts: int, progress: Callable[[str], evaluate.Watch] = lambda what: iter) -> dict[str, Any]:
     """All of type_shift.json.
 
     Args:
         run: trained.
         episodes: test episodes.
         experts: of each episode, and rollouts, that conditional realism compares.
+        progress: of a piece of work by name, goes through its parts.
     """
     setup = set_up(run, episodes)
     count = len(jax.tree.leaves(setup.test)[0])
@@ -80,21 +80,21 @@ def analyse(run: Run, episodes: int, experts: int) -> dict[str, Any]:
         "update": setup.update,
     }
     if setup.config.scene.redrivable:
-        out["realism"] = realism(setup, min(episodes, REALISM_EPISODES), experts)
+        out["realism"] = realism(setup, min(episodes, REALISM_EPISODES), experts, progress("conditional realism"))
     if not setup.learner.method.encodes:
         return out
-    types, information_bits = shift(setup), told_by_types(setup)
+    types, information_bits = shift(setup, progress("types")), told_by_types(setup)
     return out | {"types": types, "information": information_bits, "reencoding": reencoding(setup)}
 
 
-def shift(setup: Setup) -> dict[str, dict[str, list[float]]]:
+def shift(setup: Setup, watch: evaluate.Watch = iter) -> dict[str, dict[str, list[float]]]:
     """The scene's metrics per source of types, a list over seeds: 'prior', 'paired', 'same_xi', 'shuffled'."""
     scene, test = setup.config.scene, setup.test
     given = evaluate.donors(setup.learner.method, test)
     if scene.redrivable:
         others = dataset.by_others(scene, len(jax.tree.leaves(test)[0]), dataset.TEST, 1)
         given["same_xi"] = jax.tree.map(lambda x: x[:, 0], others.trajectory)
-    features = evaluate.roller(setup.learner, scene.samples)(setup.networks, test, given, stream("type shift", 0))
+    features = evaluate.roller(setup.learner, scene.samples, watch)(setup.networks, test, given, stream("type shift", 0))
     return evaluate.score(setup.config, features, evaluate.expert_features(scene, test))
 
 
@@ -157,31 +157,40 @@ def reencoding(setup: Setup) -> dict[str, list[float]]:
     return {name: [float(x) for x in np.median(values, axis=1)] for name, values in jax.device_get(run(setup.networks)).items()}
 
 
-def realism(setup: Setup, episodes: int, experts: int) -> dict[str, Any]:
+def realism(setup: Setup, episodes: int, experts: int, watch: evaluate.Watch = iter) -> dict[str, Any]:
     """Conditional realism: JSD in bits between p(tau|xi) of experts and of the agent, per feature, mean over episodes.
 
     Returns:
-        By feature: `agent`, a list over seeds, and `floor`, the same between two groups of experts of the same size.
+        By feature: `agent`, a list over seeds, `floor`, the same between two groups of experts of the same size, and the `range` of
+        the bins.
+
+    Raises:
+        RunError: a rollout is not finite.
     """
     scene = setup.config.scene
     held = jax.tree.map(lambda x: x[:episodes], setup.test)
     others = dataset.without_truth(dataset.by_others(scene, episodes, dataset.TEST, 2 * experts))
     theirs = jax.device_get(_described(scene, held, others))
-    ours = evaluate.roller(setup.learner, experts)(setup.networks, held, {}, stream("type shift", 3))["prior"]
+    ours = evaluate.roller(setup.learner, experts, watch)(setup.networks, held, {}, stream("type shift", 3))["prior"]
+    evaluate.check_finite(ours[evaluate.FINITE], "prior")
     features = {name: compared(ours[name], theirs[name]) for name in scene.described_by}
     return {"episodes": episodes, "experts": experts, "features": features}
 
 
 def compared(ours: np.ndarray, theirs: np.ndarray) -> dict[str, Any]:
-    """One feature of rollouts (seeds, rollouts, episodes, ...) and of twice as many experts (episodes, experts, ...): `agent` and `floor`.
+    """One feature of rollouts (seeds, rollouts, episodes, ...) and of twice as many experts (episodes, experts, ...), compared.
 
-    The bins span what both do: experts may all do the same.
+    Returns:
+        As `realism` says, of one feature.
+
+    The bins span what both do, since experts may all do the same: compare runs by figures of one range.
     """
     count = theirs.shape[1] // 2
     first, second = theirs[:, :count], theirs[:, count:]
     both = np.concatenate([np.ravel(x).astype(float) for x in (theirs, ours)])
-    mean = functools.partial(_mean_jsd, limits=(both.min(), max(both.max(), both.min() + 1e-6)))
-    return {"agent": [mean(of_seed.swapaxes(0, 1), first) for of_seed in ours], "floor": mean(second, first)}
+    limits = (float(both.min()), float(max(both.max(), both.min() + 1e-6)))
+    mean = functools.partial(_mean_jsd, limits=limits)
+    return {"agent": [mean(of_seed.swapaxes(0, 1), first) for of_seed in ours], "floor": mean(second, first), "range": limits}
 
 
 def _described(scene: Scene, held: Demonstration, others: Demonstration) -> dict[str, Array]:
@@ -272,11 +281,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     if options.experts < 2:
         raise UsageError(f"--experts {options.experts}: at least 2 are needed")
     cache.keep_compiled()
-    result = analyse(run, episodes, options.experts)
-    console = Console(width=None if Console().is_terminal else 140)
+    result = analyse(run, episodes, options.experts, evaluate.progress)
+    console = cli.console()
     for part in tables(result):
         console.print(part)
     write_whole(run.folder / "type_shift.json", json.dumps(result, indent=1) + "\n")
+    if not {"types", "realism"} & set(result):
+        return  # no types, and recorded episodes have one expert each
     (run.folder / "media").mkdir(exist_ok=True)
     figure(result, run.config.scene.main_metrics[0], run.folder / "media" / "type_shift.png")
 

@@ -30,8 +30,9 @@ def made(name):
 
 @functools.cache
 def demonstrated(name, count=512):
-    """Demonstrations and their features."""
+    """Demonstrations and their features, in single precision whatever the test's."""
     scene = made(name)
-    held = jax.jit(jax.vmap(lambda key: dataset.demonstrate(scene, key)))(random.split(random.key(5), count))
-    features = jax.jit(jax.vmap(lambda one: scene.features(one, one.trajectory)))(dataset.without_truth(held))
-    return jax.device_get(held), jax.device_get(features)
+    with jax.enable_x64(False):
+        held = jax.jit(jax.vmap(lambda key: dataset.demonstrate(scene, key)))(random.split(random.key(5), count))
+        features = jax.jit(jax.vmap(lambda one: scene.features(one, one.trajectory)))(dataset.without_truth(held))
+        return jax.device_get(held), jax.device_get(features)

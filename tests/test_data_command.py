@@ -63,6 +63,15 @@ def test_pictures_are_drawn_one_a_recording(folder, tmp_path):
     assert all(p.read_bytes().startswith(b"\x89PNG") and p.stat().st_size > 10_000 for p in pictures)
 
 
+def test_replay_tells_how_far_the_car_is_off_each_log(folder, capsys):
+    data.main([str(folder / "scenarionet"), "--replay"])
+    told = capsys.readouterr().out
+    rows = [line for line in told.splitlines() if "/" in line and "│" in line]
+    assert len(rows) == 2  # a row a scene
+    assert all(0 <= float(cell) < 0.5 for row in rows for cell in row.split("│")[2:6])
+    assert "median agent" in told and "95th percentile agent" in told
+
+
 @pytest.mark.parametrize(
     ("options", "status", "why"),
     [

@@ -21,6 +21,7 @@ from rtc_mjx.logs.store import scenes
 from rtc_mjx.methods import METHODS
 from rtc_mjx.physics import rest_surroundings, simulate, specialised_step
 from rtc_mjx.scenes.recorded import FOLLOWED, HEADED, Recorded, fitted, part_of
+from rtc_mjx.scenes.recorded import driven as logged
 
 STEP, SUBSTEPS = 0.3, 6
 KINDS = ("womd_scenario", "womd_tf_example", "gpudrive_json", "scenarionet_waymo", "scenarionet_nuscenes")
@@ -74,7 +75,7 @@ def test_controls_replayed_without_the_driver_give_the_same_motion():
 def test_logged_drivers_are_followed():
     """Over the vehicles that move in all recordings at hand: median 0.15 m and 95th percentile 0.5 m are wanted."""
     logs = [held.scene for held in scenes([recordings(*KINDS)], Options(road_users=4, lanes=4, edges=4))]
-    found = fitted(made("womd"), jax.tree.map(lambda *x: np.stack(x), *logs))
+    found = fitted(*(np.stack(x) for x in zip(*(logged(log, made("womd").steps) for log in logs), strict=True)))
     assert len(logs) > 200
     assert np.median(found.position_error) < 0.05 and np.percentile(found.position_error, 95) < 0.2
     assert np.mean(np.mean(found.position_error, axis=1) > FOLLOWED) < 0.02

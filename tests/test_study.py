@@ -10,7 +10,7 @@ import pytest
 from learning import SCENE
 
 from rtc_mjx import claims, dataset, evaluate, study, train, type_shift
-from rtc_mjx.errors import UsageError
+from rtc_mjx.errors import RunError, UsageError
 from rtc_mjx.methods import METHODS
 from rtc_mjx.probe import ProbeOptions, information
 from rtc_mjx.scenes import SCENES
@@ -41,7 +41,16 @@ def run_with(tmp_path, name, **metrics):
     folder.mkdir()
     types = {source: {metric: {"per_seed": values} for metric, values in of.items()} for source, of in metrics.items()}
     seeds = len(next(iter(metrics["prior"].values())))
-    result = {"metrics": types["prior"], "types": types, "reference": {}, "update": 1, "seeds": seeds, "episodes": 4}
+    result = {
+        "metrics": types["prior"],
+        "types": types,
+        "reference": {},
+        "update": 1,
+        "seeds": seeds,
+        "episodes": 4,
+        "asked": 4,
+        "commit": None,
+    }
     (folder / "evaluation.json").write_text(json.dumps(result))
     return SimpleNamespace(folder=folder, config=SimpleNamespace(scene=SimpleNamespace(main_metrics=("return",)), method=name))
 
@@ -125,6 +134,47 @@ def test_a_study_that_was_stopped_ends_like_one_that_was_not(tmp_path, monkeypat
                     "--runs", str(tmp_path / "whole/runs"), *SMALL])  # fmt: skip
 
 
+def test_one_training_that_diverges_does_not_stop_the_others(tmp_path, monkeypatch):
+    really = study.complete
+
+    def complete(entry, scene, folder):
+        if entry.name == "bc":
+            raise RunError("update 2: reconstruction of seed 0 is not finite")
+        return really(entry, scene, folder)
+
+    monkeypatch.setattr(study, "complete", complete)
+    out = tmp_path / "double_goal"
+    out.mkdir()
+    (out / "claims.md").write_text("of other runs")
+    with pytest.raises(RunError, match="bc failed: update 2"):
+        study.main(
+            [
+                "--scene",
+                "double_goal",
+                "--methods",
+                "bc,mgail",
+                "--seeds",
+                "1",
+                "--results",
+                str(tmp_path),
+                "--runs",
+                str(tmp_path / "r"),
+                *SMALL,
+            ]
+        )
+    assert (out / "mgail.json").is_file() and not (out / "bc.json").is_file() and not (out / "claims.md").is_file()
+    run = study.Run.open(tmp_path / "r" / "double_goal" / "mgail")
+    assert study._evaluated(run)
+    evaluate.main(["--run", str(run.folder), "--episodes", "8"])  # somebody looks at fewer episodes: not the study's evaluation
+    assert not study._evaluated(run)
+
+
+def test_variations_start_from_the_options_given():
+    held = study.entries("double_goal", ["rtc_c"], True, ["--losses.adversarial", "10.0"])
+    varied = [e.name for e in held if "adversarial" in e.name]
+    assert "rtc_c,losses.adversarial=10.0" not in varied and "rtc_c,losses.adversarial=1.0" in varied
+
+
 def test_variations_change_one_thing_each_and_are_settings_that_exist():
     held = study.entries("double_goal", ["rtc_c"], True, [])
     assert len({entry.name for entry in held}) == len(held) > 10
@@ -146,11 +196,11 @@ def test_conditional_realism_by_hand():
     """Two episodes, two experts and as many again for the floor; the second of two agents does what no expert does in one episode."""
     theirs = np.array([[1.0, 1.0, 1.0, 1.0], [0.0, 1.0, 1.0, 0.0]])
     ours = np.array([[[1.0, 0.0], [1.0, 1.0]], [[0.0, 0.0], [0.0, 1.0]]])  # (agents, rollouts, episodes)
-    assert type_shift.compared(ours, theirs) == {"agent": [0.0, 0.5], "floor": 0.0}
+    assert type_shift.compared(ours, theirs) == {"agent": [0.0, 0.5], "floor": 0.0, "range": (0.0, 1.0)}
     alike = type_shift.compared(np.zeros((1, 2, 2)), np.ones((2, 4)))  # experts who all do the same tell one who does not
-    assert alike == {"agent": [1.0], "floor": 0.0}
+    assert alike == {"agent": [1.0], "floor": 0.0, "range": (0.0, 1.0)}
     along = type_shift.compared(np.zeros((1, 2, 3, 5)), np.zeros((3, 4, 5)))  # a feature with a value at each of five times
-    assert along == {"agent": [0.0], "floor": 0.0}
+    assert along == {"agent": [0.0], "floor": 0.0, "range": (0.0, 1e-6)}
 
 
 @pytest.mark.parametrize("method", ["rtc_d", "bc"])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rtc_mjx.logs.convert import Converted
-from rtc_mjx.logs.scene import AMBER, CYCLIST, GREEN, NO_SIGNAL, PEDESTRIAN, RED, VEHICLE, lane_exists
+from rtc_mjx.logs.scene import AMBER, CYCLIST, GREEN, NO_SIGNAL, PEDESTRIAN, RED, VEHICLE, RoadGraph, lane_exists
 
 GROUND, LANE, EDGE, STRIPES = "#f4f3ef", "#b9bcc0", "#3c4046", "#d9d3bd"
 COLOURS = {VEHICLE: "#7d93ad", PEDESTRIAN: "#b2477a", CYCLIST: "#4f9a72"}
@@ -30,7 +30,7 @@ def draw(converted: Converted, marked: Collection[str], file: Path) -> None:
     figure = Figure(figsize=(INCHES, INCHES), dpi=PIXELS, layout="constrained", facecolor=GROUND)
     axes = figure.add_subplot(facecolor=GROUND)
     scene = converted.scene
-    _road(axes, scene)
+    draw_road(axes, scene.road)
     _signals(axes, scene)
     for user in reversed(range(len(scene.kind))):
         if scene.kind[user]:
@@ -41,10 +41,10 @@ def draw(converted: Converted, marked: Collection[str], file: Path) -> None:
     figure.savefig(file)
 
 
-def _road(axes: Any, scene: Any) -> None:
+def draw_road(axes: Any, road: RoadGraph) -> None:
+    """Crosswalks, centre lines of lanes with the way one drives, and edges, on axes in m."""
     from matplotlib.collections import LineCollection, PolyCollection
 
-    road = scene.road
     there = np.any(road.crosswalks != road.crosswalks[:, :1], axis=(1, 2))
     axes.add_collection(PolyCollection(list(road.crosswalks[there]), facecolor=STRIPES, edgecolor="none", hatch="||", zorder=1))
     lanes = np.asarray(road.lanes)[np.asarray(lane_exists(road))]

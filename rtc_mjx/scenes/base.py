@@ -77,6 +77,7 @@ class Scene(abc.ABC):
     agent_body: ClassVar[str] = "agent"
     samples: ClassVar[int] = 1  # rollouts of each test episode, every one with a type of its own
     mark_size: ClassVar[float] = 0.018  # m, radius of the marks that trails are made of in videos
+    least_view: ClassVar[float] = 1.1  # m, half a side of a sketch, at least
     side_by_side: ClassVar[bool] = False  # whether a video shows each rollout in a picture of its own
     redrivable: ClassVar[bool] = True  # whether other experts can drive an episode, and the same ones once more
     described_by: ClassVar[tuple[str, ...]] = ()  # features by which trajectories of one episode are compared
@@ -139,6 +140,10 @@ class Scene(abc.ABC):
 
     def paint(self, model: mujoco.MjModel, episode: Episode, time: int) -> None:
         """Makes a dressed model look as it does at a control step of an episode; as it is unless a scene says so."""
+        return
+
+    def sketch(self, axes: Any, episode: Episode) -> None:
+        """Draws what surrounds the agent from above, in m, on axes of matplotlib; nothing unless a scene says so."""
         return
 
     def recorded(self, part: Literal["train", "test"], count: int) -> Episode | None:

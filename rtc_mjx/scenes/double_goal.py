@@ -108,6 +108,15 @@ class DoubleGoal(Scene):
         around = episode.surroundings
         return dataclasses.replace(episode, surroundings=Surroundings(around.pose.at[..., 0].multiply(-1), around.size))
 
+    def sketch(self, axes: Any, episode: Episode) -> None:
+        """Both goals, where they are at last, and the way they came."""
+        from matplotlib.patches import Circle  # takes a while to import
+
+        for goal in (LOWER, UPPER):
+            way = np.asarray(episode.surroundings.pose[:, goal, :2])
+            axes.plot(*way.T, color="0.6", linewidth=1, zorder=1)
+            axes.add_patch(Circle(tuple(way[-1]), REACHED, facecolor="#cfe3cf", edgecolor="#4f9a72", zorder=1))
+
     def label(self, demonstration: Demonstration) -> None:
         """The double goal problem has no hand-made label: Symphony does not run on it."""
 

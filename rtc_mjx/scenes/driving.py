@@ -10,7 +10,7 @@ import abc
 import dataclasses
 import functools
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rtc_mjx import metrics
 from rtc_mjx.geometry import boxes_overlap, capsule_gap, closest_approach, corners, off_road, pose_at, project, rotate, wrapped
 from rtc_mjx.logs import AMBER, GREEN, PEDESTRIAN, RATE, RED, LoggedScene, RoadGraph
+from rtc_mjx.logs.picture import draw_road
 from rtc_mjx.physics import PhysicsState, Surroundings, World, load, rest_state, specialised_step, substates
 from rtc_mjx.physics.car import CONTROL_UNIT
 from rtc_mjx.pytree import pytree
@@ -90,6 +91,7 @@ class Driving(Scene):
     reconstructs_rollouts: ClassVar[bool] = True
     described_by: ClassVar[tuple[str, ...]] = ("collision", "offroad", "progress", "curvature", "decided", "ran_red")
     mark_size: ClassVar[float] = 0.3
+    least_view: ClassVar[float] = 20.0
     side_by_side: ClassVar[bool] = True
     steps: int = 30
     road_users: int = 8
@@ -150,6 +152,10 @@ class Driving(Scene):
     def paint(self, model: mujoco.MjModel, episode: Episode, time: int) -> None:
         """Signals, and the sizes of road users."""
         scenery.paint(model, episode.context, np.asarray(episode.surroundings.size), time)
+
+    def sketch(self, axes: Any, episode: Episode) -> None:
+        """The road."""
+        draw_road(axes, jax.tree.map(np.asarray, episode.context.graph))
 
     @abc.abstractmethod
     def log(self, key: jax.Array) -> LoggedScene:

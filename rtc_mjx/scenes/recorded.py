@@ -18,7 +18,7 @@ from typing import Any, ClassVar, Literal, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from rtc_mjx import inverse_dynamics
 from rtc_mjx.errors import UsageError
@@ -157,14 +157,9 @@ class Recorded(Driving):
         """The episode of a logged scene, with what its driver did; the car starts turning as it was logged."""
         episode = self.episode(log)
         road = RecordedRoad(**{f.name: getattr(episode.context, f.name) for f in dataclasses.fields(Road)}, actions=actions)
-        start = inverse_dynamics.start_of(*self.driven(log), CONTROL_EVERY / RATE)
+        start = inverse_dynamics.start_of(*driven(log, self.steps), CONTROL_EVERY / RATE)
         start = dataclasses.replace(start, warmstart=episode.start.warmstart)
         return dataclasses.replace(episode, start=start, context=road)
-
-    def driven(self, log: LoggedScene) -> tuple[Float[Array, "times 3"], Float[Array, "2"]]:
-        """The agent's logged poses at the control steps, headings without jumps, and its velocity at t = 0."""
-        pose = log.pose[log.controlled][::CONTROL_EVERY][: self.steps + 1]
-        return pose.at[:, 2].set(jnp.unwrap(pose[:, 2])), log.velocity[log.controlled, 0]
 
     def expert(self, key: jax.Array, episode: Episode) -> tuple[Actor, Any]:
         """The logged driver, who does what was done."""
@@ -185,14 +180,24 @@ class Recorded(Driving):
         }
 
 
-def fitted(scene: Recorded, logs: LoggedScene) -> Fit:
-    """Controls and replay errors of the agents of stacked scenes, as numpy arrays."""
+def driven(log: LoggedScene, steps: int) -> tuple[Float[Array, "times 3"], Float[Array, "2"]]:
+    """The agent's logged poses at the control steps, headings without jumps, and its velocity at t = 0."""
+    pose = jnp.asarray(log.pose[log.controlled][::CONTROL_EVERY][: steps + 1])
+    return pose.at[:, 2].set(jnp.unwrap(pose[:, 2])), jnp.asarray(log.velocity[log.controlled, 0])
 
-    def one(log: LoggedScene) -> Fit:
-        poses, velocity = scene.driven(log)
-        return inverse_dynamics.fit(inverse_dynamics.start_of(poses, velocity, CONTROL_EVERY / RATE), poses, scene.substeps)
 
-    return in_parts(jax.jit(jax.vmap(one)), jax.tree.map(jnp.asarray, logs), inverse_dynamics.AT_ONCE)
+def fitted(poses: Float[Array, "scenes times 3"], velocity: Float[Array, "scenes 2"]) -> Fit:
+    """Controls and replay errors of agents with these logged poses at the control steps, and velocities at t = 0, as numpy arrays."""
+
+    def one(held: tuple[Array, Array]) -> Fit:
+        return inverse_dynamics.fit(inverse_dynamics.start_of(*held, CONTROL_EVERY / RATE), held[0], Driving.substeps)
+
+    return in_parts(jax.jit(jax.vmap(one)), (poses, velocity), inverse_dynamics.AT_ONCE)
+
+
+def follows(fit: Fit) -> Bool[np.ndarray, "scenes"]:
+    """Of each agent, whether a car can do what it did."""
+    return (np.mean(fit.position_error, axis=1) <= FOLLOWED) & (np.mean(fit.heading_error, axis=1) <= HEADED)
 
 
 @functools.lru_cache(maxsize=8)
@@ -207,15 +212,14 @@ def _gathered(scene: Recorded, part: Part) -> Pool:
     if not chosen:
         raise UsageError(f"{scene.data}: of {len(scene.converted)} scenes none is left to {part}; give more recordings")
     logs = jax.tree.map(lambda *x: np.stack(x), *(held.scene for held in chosen))
-    fit = fitted(scene, logs)
-    error, turned = np.mean(fit.position_error, axis=1), np.mean(fit.heading_error, axis=1)
+    fit = fitted(*jax.vmap(functools.partial(driven, steps=scene.steps))(jax.tree.map(jnp.asarray, logs)))
     throughout = np.array([np.all(held.scene.valid[held.scene.controlled, : scene.logged_times]) for held in chosen])
-    follows = (error <= FOLLOWED) & (turned <= HEADED) & throughout
-    left_out = {held.name: float(e) for held, e, good in zip(chosen, error, follows, strict=True) if not good}
-    if not np.any(follows):
+    kept = follows(fit) & throughout
+    left_out = {held.name: float(np.mean(e)) for held, e, good in zip(chosen, fit.position_error, kept, strict=True) if not good}
+    if not np.any(kept):
         raise UsageError(f"{scene.data}: no car can follow any of the {len(chosen)} agents to {part}")
-    names = tuple(held.name for held, good in zip(chosen, follows, strict=True) if good)
-    return Pool(jax.tree.map(lambda x: x[follows], logs), np.asarray(fit.actions[follows]), names, left_out)
+    names = tuple(held.name for held, good in zip(chosen, kept, strict=True) if good)
+    return Pool(jax.tree.map(lambda x: x[kept], logs), np.asarray(fit.actions[kept]), names, left_out)
 
 
 def part_of(converted: Sequence[Converted], part: Part, share: float) -> list[Converted]:

@@ -5,11 +5,8 @@ Exact, no sampling; the same numbers every time. Informations in bits, losses in
 
 import argparse
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
-
-from rich.console import Console
 
 from rtc_mjx import cache, cli
 from rtc_mjx.errors import UsageError
@@ -52,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Tells it all, the quick parts first."""
     options = checked(arguments().parse_args(argv))
     cache.keep_compiled()
-    console = Console(width=None if sys.stdout.isatty() else 130)
+    console = cli.console()
     expert, settings = solutions.crossing(), learning.grid(learning.EPSILONS, learning.TYPE_KLS, learning.ADVERSARIALS)
     rows = {(e, n): solutions.measures(expert, solve(expert, e)) for e in learning.EPSILONS for n, solve in SOLUTIONS.items()}
     console.print(printing.solutions_table(expert, rows))
