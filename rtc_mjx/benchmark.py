@@ -33,6 +33,7 @@ from rtc_mjx.errors import UsageError
 from rtc_mjx.learner import compiled_chunk, start_all
 from rtc_mjx.physics import OneStep, PhysicsState, Surroundings, World, load, rest_state, rest_surroundings, simulate, specialised_step
 from rtc_mjx.physics.car import WHEELBASE
+from rtc_mjx.provenance import made_by
 
 WORLDS: dict[str, Callable[[], World]] = {
     "point_mass": lambda: load("double_goal"),
@@ -331,7 +332,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are measured
     rounds = 3 if options.quick else options.rounds
     console = cli.console()
-    report: dict[str, Any] = {"rows": [], "pile_up": {}, "update": [], "warm_first_result_s": {}}
+    report: dict[str, Any] = {"rows": [], "pile_up": {}, "update": [], "warm_first_result_s": {}} | made_by()
     if "physics" in parts:
         rows = _physics(console, names, batches, rounds, plain=not options.quick)
         report["rows"] = [vars(r) for r in rows]
