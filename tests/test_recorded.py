@@ -1,6 +1,7 @@
 """Recorded traffic as a scene: controls by inverse dynamics, replayed drivers, parts that share nothing, every method on it."""
 
 import dataclasses
+import functools
 import json
 
 import jax
@@ -132,10 +133,13 @@ def settings(method, folder):
     return config.from_command_line([*argv, *(x for name, value in SMALL.items() for x in (f"--{name}", str(value)))], "train")
 
 
+logged_drivers = functools.cache(dataset.demonstrations)  # the same for all methods
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_learns_from_recordings(method, tmp_path):
     held = settings(method, tmp_path)
-    expert = dataset.demonstrations(held.scene, held.experts.train, dataset.TRAIN)
+    expert = logged_drivers(held.scene, held.experts.train, dataset.TRAIN)
     learner = held.learner(dataset.statistics(held.scene, expert))
     before = start_all(learner, held.all_seeds)
     after, told = compiled_chunk(learner, 2)(jax.tree.map(jnp.copy, before), dataset.without_truth(expert))
