@@ -124,6 +124,7 @@ def test_observations_do_not_depend_on_where_and_which_way_the_world_lies(scene)
     assert np.allclose(*seen, atol=2e-2)
 
 
+@pytest.mark.usefixtures("quick_to_compile")
 def test_gradients_are_finite_and_right_through_a_collision(scene, x64):
     """The car runs into somebody who stands ahead: dx_T / da_t against central differences."""
     episode = jax.tree.map(lambda x: jnp.asarray(x[0], float if x.dtype.kind == "f" else None), demonstrated(scene.name)[0].episode)
@@ -414,6 +415,7 @@ def test_substates_end_where_the_rollout_goes_on():
     assert np.allclose(last.qpos, one.trajectory.states.qpos[4], atol=1e-4)
 
 
+@pytest.mark.usefixtures("quick_to_compile")
 @pytest.mark.parametrize("method", ["rtc_c", "symphony"])
 def test_methods_train_on_the_intersection(method, tmp_path):
     """A real, short training: losses by rollouts and by route labels, tests, evaluation with flipped signals."""

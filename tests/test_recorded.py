@@ -136,6 +136,7 @@ def settings(method, folder):
 logged_drivers = functools.cache(dataset.demonstrations)  # the same for all methods
 
 
+@pytest.mark.usefixtures("quick_to_compile")
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_learns_from_recordings(method, tmp_path):
     held = settings(method, tmp_path)

@@ -80,6 +80,7 @@ def test_a_rollout_is_a_function_of_its_inputs(scene):
     assert np.allclose(again.states.qpos, held.trajectory.states.qpos, atol=1e-5)
 
 
+@pytest.mark.usefixtures("quick_to_compile")
 def test_rollout_matches_c_mujoco(scene, x64):
     held = jax.tree.map(lambda x: x[1].astype(float) if x.dtype.kind == "f" else x[1], experts(scene.name))
     track = rollout(scene, playback(scene, held.trajectory.actions), held.episode)
