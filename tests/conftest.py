@@ -21,7 +21,7 @@ def x64():
 @pytest.fixture
 def quick_to_compile():
     """Without most optimisations: for programs that are compiled once and run for moments."""
-    before = jax.config.jax_disable_most_optimizations
+    before = jax.config.read("jax_disable_most_optimizations")
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", before)
