@@ -75,10 +75,10 @@ def learn(run: Run, config: Config, team: Team) -> None:
             line: dict[str, Any] = {"update": update, "wall_s": time.perf_counter() - started, "env_steps": env_steps(learner, update)}
             line |= as_lists(grid.gathered(seen))
             check_finite(line, run)
-            stop = any(team.exchange(bool(interrupted)))
             if update % config.every.test == 0 or update == config.updates:
                 line |= test(state)
             run.log(line)  # before the checkpoint: what a crash leaves without one is written again
+            stop = any(team.exchange(bool(interrupted)))
             if update % config.every.save == 0 or update == config.updates or stop:
                 run.save(update, grid.gathered(state), line["wall_s"])
             report(line)
