@@ -25,11 +25,13 @@ from rich.table import Table
 from rtc_mjx import config, dataset, sharding
 from rtc_mjx.errors import RunError
 from rtc_mjx.learner import Learner, compiled_chunk, start_all
+from rtc_mjx.scenes import Scene
 from rtc_mjx.sharding import BATCH, SEED, Grid
 
 METHOD = "rtc_c"
 UPDATES = 4  # of a timed sample
 DEVICES = (1, 2, 4)
+EXPERTS = 256  # demonstrations
 LIMIT_S = 1800  # of one process
 
 
@@ -42,19 +44,31 @@ class Case:
         devices: it runs on; 0 for the one device that needs no mesh.
         seeds: trained at once.
         batch: episodes of a minibatch.
+        steps: control steps of an episode; the scene's own if not given.
+        road_users: of driving; the scene's own if not given.
     """
 
     what: str
     devices: int
     seeds: int
     batch: int
+    steps: int | None = None
+    road_users: int | None = None
+
+    def on(self, scene: Scene) -> Scene:
+        """The scene as the case has it."""
+        changes = {"steps": self.steps, "road_users": self.road_users}
+        return dataclasses.replace(scene, **{name: value for name, value in changes.items() if value is not None})
 
 
-def cases(counts: Sequence[int] = DEVICES) -> list[Case]:
+def cases(scene: Scene, counts: Sequence[int] = DEVICES) -> list[Case]:
     """All points of all curves."""
     held = [Case("a mesh of one device", n, 1, 64) for n in (0, 1)]
     held += [Case("seeds", 0, n, 64) for n in (1, 2, 4, 8)]
     held += [Case("minibatch", 0, 1, n) for n in (16, 64, 256)]
+    held += [Case("horizon", 0, 1, 64, steps=n) for n in (scene.steps // 2, scene.steps, 2 * scene.steps)]
+    if hasattr(scene, "road_users"):
+        held += [Case("road users", 0, 1, 64, road_users=n) for n in (2, 4, 8)]
     held += [Case("strong, over seeds", n, max(counts), 64) for n in counts]
     held += [Case("strong, over the minibatch", n, 1, 64) for n in counts]
     held += [Case("weak, over seeds", n, n, 64) for n in counts]
@@ -69,7 +83,7 @@ def measure(scene: str, rounds: int, watch: Callable[[Sequence[int]], Iterable[i
         RunError: such a process failed.
     """
     found: dict[str, Any] = {"update": [], "all_reduce": []}
-    for count in watch(sorted({max(1, case.devices) for case in cases()})):
+    for count in watch(DEVICES):
         command = [sys.executable, "-m", "rtc_mjx.benchmark", "--scaling-on", str(count), "--rounds", str(rounds), "--scene", scene]
         environment = {**os.environ, "JAX_NUM_CPU_DEVICES": str(count)}
         try:
@@ -85,13 +99,14 @@ def measure(scene: str, rounds: int, watch: Callable[[Sequence[int]], Iterable[i
 
 def measure_here(scene: str, devices: int, rounds: int) -> dict[str, Any]:
     """The rows of a number of devices, in this process: all are compiled, then timed in turn; medians."""
-    mine = [case for case in cases() if max(1, case.devices) == devices]
     settings = config.defaults(scene, METHOD)
-    expert = dataset.demonstrations(settings.scene, 1024, dataset.TRAIN)
-    learner = settings.learner(dataset.statistics(settings.scene, expert))
+    mine = [case for case in cases(settings.scene) if max(1, case.devices) == devices]
     running, rows = [], []
     for case in mine:
-        chosen, grid = dataclasses.replace(learner, batch=case.batch), on(case, learner)
+        expert = dataset.demonstrations(case.on(settings.scene), EXPERTS, dataset.TRAIN)
+        told = dataclasses.replace(settings, scene=case.on(settings.scene), batch=case.batch)
+        chosen = told.learner(dataset.statistics(told.scene, expert))
+        grid = on(case, chosen)
         state, data = grid.by_seed(start_all(chosen, range(case.seeds))), grid.everywhere(dataset.without_truth(expert))
         begin = time.perf_counter()
         program = compiled_chunk(chosen, UPDATES, grid).lower(state, data).compile()
@@ -105,7 +120,7 @@ def measure_here(scene: str, devices: int, rounds: int) -> dict[str, Any]:
             spent[i].append(time.perf_counter() - begin)
     for row, case, times in zip(rows, mine, spent, strict=True):
         row["updates_per_s"] = case.seeds * UPDATES / float(np.median(times))
-    return {"update": rows, "all_reduce": [all_reduce(learner, devices, rounds)] if devices > 1 else []}
+    return {"update": rows, "all_reduce": [all_reduce(chosen, devices, rounds)] if devices > 1 else []}
 
 
 def on(case: Case, learner: Learner) -> Grid:
@@ -114,8 +129,7 @@ def on(case: Case, learner: Learner) -> Grid:
         return sharding.ONE_DEVICE
     if case.devices == 1:
         return Grid(Mesh(np.array(jax.devices()[:1]).reshape(1, 1), (SEED, BATCH)))
-    sized = dataclasses.replace(learner, batch=case.batch)
-    return sharding.grid(jax.devices(), case.seeds, [sized.size(b) for b in sized.method.branches], case.devices)
+    return sharding.grid(jax.devices(), case.seeds, [learner.size(b) for b in learner.method.branches], case.devices)
 
 
 def all_reduce(learner: Learner, devices: int, rounds: int) -> dict[str, Any]:
@@ -140,13 +154,14 @@ def _temp_mb(program: jax.stages.Compiled) -> float | None:
 def table(found: dict[str, Any], scene: str) -> Table:
     """The rows for the terminal, each with its ratio to the first of its curve."""
     out = Table(title=f"Updates of {METHOD} on {scene}: of one seed, a second")
-    for column in ("curve", "devices", "seeds", "minibatch", "updates/s", "x first", "compile s", "temp MB"):
+    for column in ("curve", "devices", "seeds", "minibatch", "steps", "users", "updates/s", "x first", "compile s", "temp MB"):
         out.add_column(column, justify="left" if column == "curve" else "right")
     for what in dict.fromkeys(row["what"] for row in found["update"]):
         rows = [row for row in found["update"] if row["what"] == what]
         for row in rows:
             speed, first = row["updates_per_s"], rows[0]["updates_per_s"]
-            cells = (what, row["devices"] or "1, no mesh", row["seeds"], row["batch"], f"{speed:.1f}", f"{speed / first:.2f}")
+            case = (what, row["devices"] or "1, no mesh", row["seeds"], row["batch"], row["steps"] or "", row["road_users"] or "")
             memory = f"{row['temp_mb']:.1f}" if row["temp_mb"] is not None else "-"
-            out.add_row(*map(str, cells), f"{row['compile_s']:.1f}", memory, end_section=row is rows[-1])
+            measured = (f"{speed:.1f}", f"{speed / first:.2f}", f"{row['compile_s']:.1f}", memory)
+            out.add_row(*map(str, case), *measured, end_section=row is rows[-1])
     return out

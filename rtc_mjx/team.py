@@ -121,12 +121,12 @@ class Team:
         if not self.links:
             return [value]
         if not self.leads:
-            self.links[0].send(value=value)
+            self._send(0, value=value)
             return list(self._inbox[0].get())
         values = [value, *(self._inbox[process].get() for process in sorted(self.links))]
         self._parting = last
-        for link in self.links.values():
-            link.send(values=values, last=last)
+        for process in self.links:
+            self._send(process, values=values, last=last)
         return values
 
     def of_first(self, value: Any) -> Any:
@@ -147,6 +147,13 @@ class Team:
                 link.send(stop=reason, status=status)
         if self.leads and self.links:
             time.sleep(GRACE_S)
+
+    def _send(self, process: int, **message: Any) -> None:
+        try:
+            self.links[process].send(**message)
+        except OSError:
+            time.sleep(2 * self.patience)  # it is gone: the watch says so meanwhile, and ends this process
+            raise
 
     def _listen(self, process: int) -> None:
         link, reason, status = self.links[process], "", 1

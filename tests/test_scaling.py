@@ -175,6 +175,17 @@ def test_processes_that_differ_all_say_so_in_one_line(others, named):
             raise end
 
 
+def test_a_process_that_falls_silent_ends_the_others(monkeypatch, capsys):
+    """It hangs, or its machine is gone: its line stays open, and nothing comes."""
+    port, ends = free_port(), queue.SimpleQueue()
+    monkeypatch.setattr("rtc_mjx.team.leave", ends.put)
+    first, silent = together(meeting(port, 0, 2, patience=1), meeting(port, 1, 2, patience=1))
+    first.watch()
+    assert ends.get(timeout=10) == 1
+    assert f"{first.name(1)} has not been heard of for 1 s; all processes stop, --resume goes on" in capsys.readouterr().err
+    close([first, silent])
+
+
 def test_two_processes_of_one_number_are_refused():
     port = free_port()
     ends = together(meeting(port, 0, 3), meeting(port, 1, 3), meeting(port, 1, 3))
