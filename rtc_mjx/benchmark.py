@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from rtc_mjx import cache, cli, config, dataset, pile_up
+from rtc_mjx import cache, cli, config, dataset, pile_up, scaling
 from rtc_mjx.errors import UsageError
 from rtc_mjx.learner import compiled_chunk, start_all
 from rtc_mjx.physics import OneStep, PhysicsState, Surroundings, World, load, rest_state, rest_surroundings, simulate, specialised_step
@@ -308,6 +308,9 @@ def arguments() -> argparse.ArgumentParser:
     parser.add_argument("--worlds", default=",".join(WORLDS), help="comma-separated, of %(default)s")
     parser.add_argument("--batches", default=",".join(map(str, BATCHES)), help="comma-separated batch sizes (default %(default)s)")
     parser.add_argument("--rounds", type=int, default=7, help="timed rounds, of which the median counts (default %(default)s)")
+    parser.add_argument("--scaling", action="store_true", help="measure instead how updates scale with seeds, minibatch and devices")
+    parser.add_argument("--scene", default="double_goal", metavar="NAME", help="of --scaling (default %(default)s)")
+    parser.add_argument("--scaling-on", type=int, metavar="N", help="only print the rows of so many devices, as JSON")
     parser.add_argument(
         "--first-result", metavar="WORLD", help="only print the seconds from the call to the first gradient, with the cache as it is"
     )
@@ -321,17 +324,26 @@ def main(argv: Sequence[str] | None = None) -> None:
         _chosen("world", options.first_result, WORLDS)
         sys.stdout.write(f"{_first_result(options.first_result)}\n")
         return
+    if options.rounds < 1:
+        raise UsageError(f"--rounds {options.rounds}: at least 1 is needed")
     parts = _chosen("part", options.parts or ",".join(PARTS[: 2 if options.quick else 3]), PARTS)
     names = _chosen("world", options.worlds, WORLDS)
     batches = [64] if options.quick else _batches(options.batches)
-    if options.rounds < 1:
-        raise UsageError(f"--rounds {options.rounds}: at least 1 is needed")
     for path in (options.json, options.figure):
         if path is not None and not path.absolute().parent.is_dir():
             raise UsageError(f"{path}: there is no folder {path.absolute().parent}")
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are measured
+    if options.scaling_on:
+        sys.stdout.write(json.dumps(scaling.measure_here(options.scene, options.scaling_on, options.rounds)) + "\n")
+        return
     rounds = 3 if options.quick else options.rounds
     console = cli.console()
+    if options.scaling:
+        config.defaults(options.scene, scaling.METHOD)  # raises here what would be raised in each process
+        found = _scaling(console, options.scene, rounds)
+        if options.json:
+            options.json.write_text(json.dumps({"scaling": found} | made_by(), indent=1))
+        return
     report: dict[str, Any] = {"rows": [], "pile_up": {}, "update": [], "warm_first_result_s": {}} | made_by()
     if "physics" in parts:
         rows = _physics(console, names, batches, rounds, plain=not options.quick)
@@ -353,6 +365,21 @@ def main(argv: Sequence[str] | None = None) -> None:
             console.print(f"{name}: first gradient {seconds:.1f} s after the call, with a warm cache")
     if options.json:
         options.json.write_text(json.dumps(report, indent=1))
+
+
+def _scaling(console: Console, scene: str, rounds: int) -> dict[str, Any]:
+    """How updates scale; says on stderr where it is."""
+
+    def watch(counts: Sequence[int]) -> Iterator[int]:
+        for count in counts:
+            sys.stderr.write(f"benchmark: {count} device{'s' * (count > 1)}\n")
+            yield count
+
+    found = scaling.measure(scene, rounds, watch)
+    console.print(scaling.table(found, scene))
+    for row in found["all_reduce"]:
+        console.print(f"all-reduce of one gradient over {row['devices']} devices: {row['bytes']:,} bytes, {row['ms']:.2f} ms")
+    return found
 
 
 def _physics(console: Console, names: Sequence[str], batches: Sequence[int], rounds: int, plain: bool) -> list[Row]:

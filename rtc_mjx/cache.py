@@ -5,6 +5,7 @@ import io
 import json
 import logging
 import os
+import platform
 import tempfile
 from collections.abc import Iterable, Mapping
 from importlib import metadata
@@ -30,6 +31,14 @@ def keep_compiled() -> Path:
     jax.config.update("jax_compilation_cache_dir", str(kept))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     return kept
+
+
+def versions() -> dict[str, str]:
+    """Of Python and of the packages that results depend on, and a hash of this package's own code, by name."""
+    here = Path(__file__).parent
+    code = hashlib.sha256(b"".join(file.read_bytes() for file in sorted(here.rglob("*.py")))).hexdigest()[:12]
+    named = {name: metadata.version(name) for name in VERSIONS}
+    return {"Python": platform.python_version(), **named, "rtc_mjx code": code}
 
 
 def fingerprint(made_by: Mapping[str, Any], code: Iterable[Path]) -> str:

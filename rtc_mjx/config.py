@@ -16,10 +16,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
+from rtc_mjx.cluster import Hardware
 from rtc_mjx.errors import UsageError
 from rtc_mjx.files import write_whole
 from rtc_mjx.learner import Learner, OptimiserOptions
@@ -76,6 +77,7 @@ class Config:
         optimiser: gradients and rates.
         experts: demonstrations.
         every: intervals.
+        hardware: where it runs; it is not written down, since no result depends on it.
     """
 
     scene: Scene = field(default_factory=DoubleGoal)
@@ -92,6 +94,7 @@ class Config:
     optimiser: OptimiserOptions = OptimiserOptions()
     experts: Experts = Experts()
     every: Intervals = Intervals()
+    hardware: Annotated[Hardware, tyro.conf.arg(name="")] = Hardware()
 
     @property
     def folder(self) -> Path:
@@ -185,7 +188,7 @@ def defaults(scene: str, method: str) -> Config:
         if name not in METHODS:
             raise UsageError(f"{file}: [methods.{name}]: no such method; there are {', '.join(METHODS)}")
     for held in (table, *by_method.values()):
-        for key in ("method", "run", "resume"):
+        for key in ("method", "run", "resume", "hardware"):
             if key in held:
                 raise UsageError(f"{file}: '{key}' is chosen on the command line")
     merged = merge(merge(config, table, str(file)), by_method.get(method, {}), f"{file} [methods.{method}]")
@@ -312,6 +315,7 @@ def check_values(config: Config) -> Config:
     Raises:
         UsageError: the first that is not; one line with its option and what is accepted.
     """
+    config.hardware.check()
     values = flat(to_dict(config))
     for name, value in values.items():
         option = f"--{name.replace('_', '-')} {value}"
@@ -342,6 +346,7 @@ def to_dict(config: Config) -> dict[str, Any]:
     table = dataclasses.asdict(config)
     table["scene"] = {"name": config.scene.name, **table["scene"]}
     table["run"], table["resume"] = None, False
+    del table["hardware"]
     return table
 
 

@@ -22,6 +22,10 @@ class RunError(RuntimeError):
     """A failure that is not the user's wrong use, in one line; commands exit with status 1."""
 
 
+class DivergedError(RunError):
+    """A training has diverged; processes that train together all find it at once."""
+
+
 @contextlib.contextmanager
 def quiet_destructors() -> Iterator[None]:
     """Around a library call that may fail: what it leaves half-made complains once more when it is freed, and says nothing new."""

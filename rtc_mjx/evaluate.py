@@ -37,6 +37,7 @@ from rtc_mjx.provenance import made_by
 from rtc_mjx.pytree import in_parts
 from rtc_mjx.runs import Run
 from rtc_mjx.scenes import Recorded, Scene
+from rtc_mjx.sharding import ONE_DEVICE, Grid
 from rtc_mjx.trained import trained
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
@@ -62,13 +63,14 @@ def elsewhere(held: Any) -> Any:
     return jax.tree.map(lambda x: jnp.roll(x, len(x) // 2, axis=0), held)
 
 
-def roller(learner: Learner, samples: int, watch: Watch = iter) -> Roll:
+def roller(learner: Learner, samples: int, watch: Watch = iter, grid: Grid = ONE_DEVICE) -> Roll:
     """A function (networks, test demonstrations, donors, key) -> features per type source, as numpy arrays (seeds, samples, episodes).
 
     Args:
         learner: who is tested; the networks are those of all seeds.
         samples: rollouts of each episode, every one with a type of its own.
         watch: goes through the parts of the work, such as a progress bar.
+        grid: the devices that share the episodes.
     """
 
     def one(networks: Networks, mine: Demonstration, given: Donors, key: Array) -> dict[str, dict[str, Array]]:
@@ -79,16 +81,17 @@ def roller(learner: Learner, samples: int, watch: Watch = iter) -> Roll:
         tracks = {name: learner.play(agent, mine.episode, typed.agent_type, noise) for name, typed in types.items()}
         return {name: learner.scene.features(mine, track) | {FINITE: _finite(track)} for name, track in tracks.items()}
 
-    @jax.jit
     def several(networks: Networks, held: tuple[Demonstration, Donors, Array]) -> dict[str, dict[str, Array]]:
         return jax.vmap(jax.vmap(functools.partial(one, networks), in_axes=(None, None, 0)))(*held)
+
+    compiled = grid.over_rows(several)
 
     def roll(networks: Networks, test: Demonstration, given: Donors, key: Array) -> dict[str, Features]:
         count, seeds = (jax.tree.leaves(x)[0].shape[0] for x in (test, networks))
         keys = jax.vmap(lambda episode: random.split(random.fold_in(key, episode), samples))(jnp.arange(count))
         of_seeds = []
         for seed in range(seeds):
-            mine = functools.partial(several, jax.tree.map(lambda x, i=seed: x[i], networks))
+            mine = functools.partial(compiled, jax.tree.map(lambda x, i=seed: x[i], networks))
             of_seeds.append(in_parts(mine, (test, given, keys), part_size(count, samples), watch))
         return jax.tree.map(lambda *x: np.stack(x).swapaxes(1, 2), *of_seeds)
 

@@ -10,6 +10,7 @@ step causes later, is applied to the networks afterwards. The sum is the same gr
 a fraction of the cost, and each trajectory's share can be inspected before it counts.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -31,6 +32,7 @@ from rtc_mjx.physics import OneStep
 from rtc_mjx.pytree import pytree
 from rtc_mjx.rollout import GradientMode, rollout
 from rtc_mjx.scenes import Scene
+from rtc_mjx.sharding import ALL_ROWS, ONE_DEVICE, Grid, Rows
 from rtc_mjx.trajectory import Demonstration, Episode, Trajectory
 
 
@@ -77,6 +79,7 @@ class Learner:
         batch: episodes of a minibatch.
         encoder_share: the paper's f.
         one_step: physics in place of the scene's own.
+        shared: how the rows of the minibatch are shared out among devices.
     """
 
     scene: Scene
@@ -90,6 +93,7 @@ class Learner:
     batch: int
     encoder_share: float
     one_step: OneStep | None = None
+    shared: Rows = ALL_ROWS
 
     def agent(self, networks: Networks) -> Agent:
         """The agent that these networks make."""
@@ -99,14 +103,24 @@ class Learner:
         """The rows of the minibatch that a branch takes."""
         return branch.rows(self.batch, self.encoder_share)
 
+    def size(self, branch: Branch) -> int:
+        """The number of these rows, on all devices together."""
+        rows = self.rows(branch)
+        return rows.stop - rows.start
+
+    @property
+    def closed_loop(self) -> tuple[Branch, ...]:
+        """The branches that are played."""
+        return tuple(b for b in self.method.branches if b.closed_loop)
+
     def losses(self, branch: Branch) -> tuple[str, ...]:
         """The losses of a branch that the scene has."""
         return tuple(name for name in branch.losses if name != "reconstruction" or self.scene.reconstructs_rollouts)
 
     def part(self, branch: Branch, batch: Demonstration) -> Demonstration:
-        """A branch's rows of the minibatch."""
+        """A branch's rows of the minibatch, as far as this device has them."""
         rows = self.rows(branch)
-        return jax.tree.map(lambda x: x[rows], batch)
+        return self.shared.mine(jax.tree.map(lambda x: x[rows], batch), self.size(branch))
 
     def play(self, agent: Agent, episode: Episode, agent_type: Array, key: Array, nudge: Array | None = None) -> Trajectory:
         """One rollout of the policy under one type, with `nudge` (T, outputs) added to its outputs to differentiate by."""
@@ -178,12 +192,13 @@ def train_step(learner: Learner, state: TrainState, expert: Demonstration) -> tu
     return TrainState(optax.apply_updates(state.networks, step), optimiser, state.seed, state.update + 1), report
 
 
-def compiled_chunk(learner: Learner, length: int) -> jax.stages.Wrapped:
-    """`length` updates of all seeds as one program; returns the means of what the updates report.
+def compiled_chunk(learner: Learner, length: int, grid: Grid = ONE_DEVICE) -> jax.stages.Wrapped:
+    """`length` updates of all seeds as one program on the devices of a grid; returns the means of what the updates report.
 
     On a CPU one seed already fills the matrix units, and all seeds' activations together would not fit its caches: there seeds take
     turns within the program. Elsewhere they are one more axis.
     """
+    learner = dataclasses.replace(learner, shared=grid.rows)
 
     def all_seeds(states: TrainState, expert: Demonstration) -> tuple[TrainState, dict[str, Array]]:
         def one_seed(state: TrainState) -> tuple[TrainState, dict[str, Array]]:
@@ -192,7 +207,7 @@ def compiled_chunk(learner: Learner, length: int) -> jax.stages.Wrapped:
 
         return lax.map(one_seed, states) if jax.default_backend() == "cpu" else jax.vmap(one_seed)(states)
 
-    return jax.jit(all_seeds, donate_argnums=0)
+    return jax.jit(grid.over_seeds(all_seeds), donate_argnums=0)
 
 
 def gradients(learner: Learner, networks: Networks, batch: Demonstration, key: Array, update: Array) -> tuple[Networks, dict[str, Array]]:
@@ -211,9 +226,9 @@ def gradients(learner: Learner, networks: Networks, batch: Demonstration, key: A
             lost = branch_losses(learner, held, batch, now, Played(tracks, alive), extra, CLOSED_LOOP)
             return learner.weights.total(lost, update)
 
-        cotangents, guarded = guard(
-            pull(jax.grad(by_rollouts)(played.tracks)), alive, branch_sizes(learner), learner.optimiser.trajectory_clip
-        )
+        largest, branches = learner.optimiser.trajectory_clip, [learner.size(b) for b in learner.closed_loop]
+        by_outputs = pull(jax.grad(by_rollouts)(played.tracks))
+        cotangents, guarded = guard(by_outputs, alive, branch_sizes(learner), largest, learner.shared, branches)
 
     def total(networks: Networks) -> tuple[Array, dict[str, Array]]:
         agent = learner.agent(networks)
@@ -226,7 +241,7 @@ def gradients(learner: Learner, networks: Networks, batch: Demonstration, key: A
         return learner.weights.total(lost, update) + critic + jnp.sum(cotangents * outputs), lost | seen
 
     gradient, report = jax.grad(total, has_aux=True)(networks)
-    return gradient, report | guarded
+    return learner.shared.total((gradient, report | guarded))
 
 
 def infer(learner: Learner, agent: Agent, batch: Demonstration, key: Array) -> list[Typed]:
@@ -234,7 +249,7 @@ def infer(learner: Learner, agent: Agent, batch: Demonstration, key: Array) -> l
     typed = []
     for index, branch in enumerate(learner.method.branches):
         mine = learner.part(branch, batch)
-        keys = random.split(random.fold_in(key, index), len(jax.tree.leaves(mine)[0]))
+        keys = learner.shared.mine(random.split(random.fold_in(key, index), learner.size(branch)), learner.size(branch))
         typed.append(jax.vmap(functools.partial(SOURCES[branch.types], agent))(mine, keys))
     return typed
 
@@ -266,26 +281,29 @@ def play_together(learner: Learner, agent: Agent, batch: Demonstration, typed: l
     Returns:
         The rollouts, and the function from a gradient by them to that by the policy's outputs at each step.
     """
-    rows = [np.arange(learner.batch)[learner.rows(b)] for b in learner.method.branches if b.closed_loop]
+    rows, sizes = [np.arange(learner.batch)[learner.rows(b)] for b in learner.closed_loop], [learner.size(b) for b in learner.closed_loop]
     if not rows:
         return None, lambda tracks: tracks.actions
-    episodes = jax.tree.map(lambda x: x[np.concatenate(rows)], batch.episode)
+    episodes = learner.shared.mine(jax.tree.map(lambda x: x[np.concatenate(rows)], batch.episode), *sizes)
     g = joined_types(learner, typed)
-    keys = random.split(key, len(g))
+    keys = learner.shared.mine(random.split(key, sum(sizes)), *sizes)
 
     def play(nudge: Array) -> Trajectory:
         return jax.vmap(functools.partial(learner.play, agent))(episodes, g, keys, nudge)
 
     tracks, back = jax.vjp(play, jnp.zeros((len(g), learner.scene.steps, agent.outputs)))
     finite = [jnp.all(jnp.isfinite(x), axis=tuple(range(1, x.ndim))) for x in jax.tree.leaves(tracks)]
-    alive = functools.reduce(jnp.logical_and, finite)
+    alive = learner.shared.counting(functools.reduce(jnp.logical_and, finite), *sizes)
     return Played(_only(alive, tracks), alive), lambda gradient: back(gradient)[0]
 
 
 def branch_losses(
     learner: Learner, agent: Agent, batch: Demonstration, typed: list[Typed], played: Played | None, key: Array, names: frozenset[str]
 ) -> dict[str, Array]:
-    """Each loss of `names` as the sum over branches of its mean over the branch's rows (its rollouts that are finite, if it reads them)."""
+    """Each loss of `names` as the sum over branches of its mean over the branch's rows (its rollouts that are finite, if it reads them).
+
+    Of several devices each has its share of the sum.
+    """
     sums: dict[str, Array] = {}
     first = 0
     for branch, types in zip(learner.method.branches, typed, strict=True):
@@ -295,10 +313,11 @@ def branch_losses(
         if branch.closed_loop:
             part = jax.tree.map(lambda x, a=first, n=count: x[a : a + n], played)
             first += count
-        cases = Case(mine, types, part.tracks, random.split(key, count))
+        cases = Case(mine, types, part.tracks, learner.shared.mine(random.split(key, learner.size(branch)), learner.size(branch)))
         for name in (n for n in learner.losses(branch) if n in names):
             each = jax.vmap(lambda case, loss=LOSSES[name]: loss(agent, case, learner.weights))(cases)
-            sums[name] = sums.get(name, 0.0) + _mean(each, part.alive if name in CLOSED_LOOP else jnp.ones(count, bool))
+            counts = part.alive if name in CLOSED_LOOP else learner.shared.counting(jnp.ones(count, bool), learner.size(branch))
+            sums[name] = sums.get(name, 0.0) + learner.shared.mean_where(each, counts)
     return sums
 
 
@@ -306,47 +325,51 @@ def critic_loss(learner: Learner, agent: Agent, batch: Demonstration, played: Pl
     """The discriminator's loss on demonstrations and on the rollouts of all branches, at random times; and its accuracies."""
     steps = learner.scene.steps
     times = random.permutation(key, steps)[: learner.optimiser.discriminator_steps or steps]
-    real, fake = (lax.stop_gradient((t.observations[:, times], t.actions[:, times])) for t in (batch.trajectory, played.tracks))
+    shared, tracks = learner.shared, (learner.shared.mine(batch.trajectory, learner.batch), played.tracks)
+    real, fake = (lax.stop_gradient((t.observations[:, times], t.actions[:, times])) for t in tracks)
     real_logit, fake_logit = jax.vmap(agent.logit)(*real), jax.vmap(agent.logit)(*fake)
-    entropy = jnp.mean(jax.nn.softplus(-real_logit)) + _mean(jnp.mean(jax.nn.softplus(fake_logit), axis=1), played.alive)
-    penalty = gradient_penalty(agent, *real)
+    on_real = shared.mean_of(lambda logit: jnp.mean(jax.nn.softplus(-logit)), real_logit, learner.batch)
+    entropy = on_real + shared.mean_where(jnp.mean(jax.nn.softplus(fake_logit), axis=1), played.alive)
+    penalty = shared.mean_of(lambda pairs: gradient_penalty(agent, *pairs), real, learner.batch)
     report = {
         "discriminator": entropy,
         "discriminator_penalty": penalty,
-        "accuracy_expert": jnp.mean(real_logit > 0),
-        "accuracy_policy": _mean(jnp.mean(fake_logit < 0, axis=1), played.alive),
+        "accuracy_expert": shared.mean_of(jnp.mean, real_logit > 0, learner.batch),
+        "accuracy_policy": shared.mean_where(jnp.mean(fake_logit < 0, axis=1), played.alive),
     }
     return entropy + learner.weights.discriminator_penalty * penalty, report
 
 
 def branch_sizes(learner: Learner) -> Int[np.ndarray, "rows"]:
-    """For each rollout of an update, the number of rollouts that its branch's means are over."""
-    sizes = [rows.stop - rows.start for rows in (learner.rows(b) for b in learner.method.branches if b.closed_loop)]
-    return np.repeat(sizes, sizes)
+    """For each rollout that this device makes in an update, the number of rollouts that its branch's means are over."""
+    sizes = [learner.size(b) for b in learner.closed_loop]
+    return np.repeat(sizes, [learner.shared.count(size) for size in sizes])
 
 
 def guard(
-    gradient: Float[Array, "rows steps outputs"], alive: Array, sizes: Int[np.ndarray, "rows"], largest: float
+    gradient: Float[Array, "rows steps outputs"],
+    alive: Array,
+    sizes: Int[np.ndarray, "rows"],
+    largest: float,
+    shared: Rows = ALL_ROWS,
+    branches: Sequence[int] = (),
 ) -> tuple[Array, dict[str, Array]]:
     """Clips each trajectory's gradient to `largest`; one that is not finite is dropped and counted.
 
-    A loss is a mean over the `sizes` rollouts of a branch: times that number, a trajectory's gradient is that of its own loss.
+    A loss is a mean over the `sizes` rollouts of a branch: times that number, a trajectory's gradient is that of its own loss. `branches`
+    are the numbers of rollouts of each branch, on all devices that share them.
     """
     norms = jnp.sqrt(jnp.sum(gradient**2, axis=(1, 2))) * sizes
     good = alive & jnp.isfinite(norms)
     safe = jnp.where(good, norms, 0.0)
     factor = jnp.minimum(1.0, largest / jnp.maximum(safe, 1e-12))
     report = {
-        "trajectory_gradient": _mean(safe, good),
-        "trajectories_clipped": jnp.mean(safe > largest),
-        "trajectories_dropped": jnp.sum(~good),
+        "trajectory_gradient": shared.mean_where(safe, good),
+        "trajectories_clipped": shared.mean_of(jnp.mean, safe > largest, *branches),
+        "trajectories_dropped": jnp.sum(shared.counting(~good, *branches)),
     }
     return _only(good, gradient) * factor[:, None, None], report
 
 
 def _only(kept: Array, tree: Any) -> Any:
     return jax.tree.map(lambda x: jnp.where(kept.reshape(-1, *[1] * (x.ndim - 1)), x, 0), tree)
-
-
-def _mean(values: Array, counts: Array) -> Array:
-    return jnp.sum(jnp.where(counts, values, 0)) / jnp.maximum(1, jnp.sum(counts))

@@ -181,6 +181,21 @@ class Run:
             yield
 
 
+class Follower(Run):
+    """A run as processes other than the first see it: they train along and leave the writing to the first."""
+
+    def log(self, line: dict[str, Any]) -> None:
+        """Nothing."""
+
+    def save(self, update: int, state: Any, wall_s: float) -> None:
+        """Nothing."""
+
+    @contextlib.contextmanager
+    def lock(self) -> Iterator[None]:
+        """Nothing: the first process holds it."""
+        yield
+
+
 def _orbax() -> Any:
     import orbax.checkpoint  # takes seconds to import: not for those who do not save
 
@@ -190,7 +205,11 @@ def _orbax() -> Any:
 
 def _manager(folder: Path) -> Any:
     ocp = _orbax()
-    options = ocp.CheckpointManagerOptions(max_to_keep=KEPT, enable_async_checkpointing=False)
+    named: dict[str, Any] = {}
+    if jax.process_count() > 1:  # the first alone writes and reads; orbax would wait for the others
+        alone = ocp.options.MultiprocessingOptions(primary_host=0, active_processes={0}, barrier_sync_key_prefix="first")
+        named = {"multiprocessing_options": alone, "create": False}
+    options = ocp.CheckpointManagerOptions(max_to_keep=KEPT, enable_async_checkpointing=False, **named)
     return ocp.CheckpointManager(folder.absolute(), options=options)
 
 

@@ -19,11 +19,13 @@ from rich.console import Console
 from rich.markdown import Markdown
 
 from rtc_mjx import cache, claims, cli, config, evaluate, report, train
-from rtc_mjx.errors import RunError, UsageError
+from rtc_mjx.cluster import joined
+from rtc_mjx.errors import DivergedError, RunError, UsageError
 from rtc_mjx.files import write_whole
 from rtc_mjx.methods import METHODS, method_name
 from rtc_mjx.runs import Run
 from rtc_mjx.scenes import scene_type
+from rtc_mjx.team import ALONE, Team
 
 COMMAND = "python -m rtc_mjx.study"
 VARIED = "rtc_c"  # the method whose parts are varied
@@ -72,21 +74,34 @@ def on_scene(scene: str, options: Sequence[str]) -> list[str]:
     return [name for name, method in METHODS.items() if method.kind != "label" or held.labels]
 
 
-def complete(entry: Entry, scene: str, folder: Path) -> Run:
-    """The entry's run, trained to its last update and evaluated there; only what is missing is done."""
-    if folder.is_dir() and not (folder / "config.json").is_file():
-        if any(not part.name.startswith(".") for part in folder.iterdir()):
-            raise UsageError(f"{folder} is in the way: it is not a run directory")
-        shutil.rmtree(folder)  # stopped before it was begun
-    again = ["--resume"] if folder.is_dir() else []
+def complete(entry: Entry, scene: str, folder: Path, team: Team = ALONE) -> Run:
+    """The entry's run, trained to its last update and evaluated there; only what is missing is done.
+
+    Of several processes the first says what is missing, and evaluates.
+    """
+    if team.leads:
+        make_way(folder)
+    again = ["--resume"] if team.of_first(folder.is_dir()) else []
     argv = ["--scene", scene, "--method", entry.method, "--run", str(folder), *entry.options, *again]
     settings = config.from_command_line(argv, COMMAND)
     run = Run.open(folder) if again else None
-    if run is None or settings.updates not in run.checkpoints():
-        run = train.train(settings)
-    if not _evaluated(run):
+    if team.of_first(run is None or settings.updates not in run.checkpoints()) or run is None:
+        run = train.train(settings, team)
+    if team.leads and not _evaluated(run):
         evaluate.main(["--run", str(folder)])
     return run
+
+
+def make_way(folder: Path) -> None:
+    """Takes away what was stopped before it was begun.
+
+    Raises:
+        UsageError: something else stands there.
+    """
+    if folder.is_dir() and not (folder / "config.json").is_file():
+        if any(not part.name.startswith(".") for part in folder.iterdir()):
+            raise UsageError(f"{folder} is in the way: it is not a run directory")
+        shutil.rmtree(folder)
 
 
 def whole_or_small(scene: str, methods: Sequence[str], folder: Path, small: Sequence[str]) -> dict[str, Run]:
@@ -150,21 +165,35 @@ def main(argv: Sequence[str] | None = None) -> None:
     cache.keep_compiled()
     folder, out = (options.runs or Path("runs/study")) / options.scene, options.results / options.scene
     wanted = entries(options.scene, chosen, options.ablations, ["--seeds", str(options.seeds), *rest])
+    first = config.from_command_line(["--scene", options.scene, "--method", chosen[0], *wanted[0].options], COMMAND)
+    told = {**train.agreed(first), "--methods": ",".join(chosen), "--ablations": options.ablations, "--runs": str(folder)}
+    with joined(first.hardware, told) as team:
+        text, failed = conduct(options.scene, wanted, folder, out, team)
+        if team.leads:
+            cli.console().print(Markdown(text))
+    if failed:
+        raise RunError("; ".join(f"{name} failed: {error}" for name, error in failed.items()))
+
+
+def conduct(scene: str, wanted: Sequence[Entry], folder: Path, out: Path, team: Team) -> tuple[str, dict[str, RunError]]:
+    """Completes all entries; returns the tables, in the first process, and which entries failed."""
     runs: dict[str, Run] = {}
     failed: dict[str, RunError] = {}
     text = ""
     for number, entry in enumerate(wanted, 1):
-        Console(stderr=True).print(f"[{number}/{len(wanted)}] {entry.name}", markup=False)
+        if team.leads:
+            Console(stderr=True).print(f"[{number}/{len(wanted)}] {entry.name}", markup=False)
         try:
-            runs[entry.name] = complete(entry, options.scene, folder / entry.name)
+            runs[entry.name] = complete(entry, scene, folder / entry.name, team)
         except RunError as error:  # such as a seed that diverged: the other entries do not depend on it
+            if team.links and not isinstance(error, DivergedError):
+                raise  # that is not known in all processes
             failed[entry.name] = error
             Console(stderr=True).print(f"{entry.name}: {error}", markup=False)
             continue
-        text = write(options.scene, runs, out)  # after each: a study that is stopped leaves what it has
-    cli.console().print(Markdown(text))
-    if failed:
-        raise RunError("; ".join(f"{name} failed: {error}" for name, error in failed.items()))
+        if team.leads:
+            text = write(scene, runs, out)  # after each: a study that is stopped leaves what it has
+    return text, failed
 
 
 if __name__ == "__main__":

@@ -3,69 +3,114 @@
     settings -> demonstrations -> state (resumed or new) -> chunks of updates, all seeds in one program -> metrics, checkpoints
 
 All randomness is a function of seed and update, and what happens at an update does not depend on where the run was resumed: a
-run that was killed and resumed writes the same metrics.jsonl (but for wall_s) as one that was not.
+run that was killed and resumed writes the same metrics.jsonl (but for wall_s) as one that was not. Nor does it depend, but for
+rounding, on the number of devices and processes (`--distributed`); of several processes the first alone writes and shows.
 """
 
+import contextlib
 import functools
 import math
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import numpy as np
 
-from rtc_mjx import cache, cli, dataset, evaluate
+from rtc_mjx import cache, cli, dataset, evaluate, sharding
 from rtc_mjx import config as settings
+from rtc_mjx.cluster import joined
 from rtc_mjx.config import Config
-from rtc_mjx.errors import RunError
+from rtc_mjx.errors import DivergedError
 from rtc_mjx.keys import stream
 from rtc_mjx.learner import Learner, TrainState, compiled_chunk, start_all, start_shapes
 from rtc_mjx.progress import Reporter
-from rtc_mjx.runs import Run
+from rtc_mjx.runs import Follower, Run
+from rtc_mjx.sharding import Grid
+from rtc_mjx.team import ALONE, Team
 
 
-def train(config: Config) -> Run:
+def train(config: Config, team: Team = ALONE) -> Run:
     """Trains, or goes on training; returns the run.
+
+    Args:
+        config: the settings.
+        team: the processes that train together, all of which call this.
 
     Raises:
         UsageError: the run directory cannot be used.
+        DivergedError: what is learned is not finite any more.
         RunError: a checkpoint could not be written.
         KeyboardInterrupt: interrupted; a checkpoint was saved first.
     """
     config = settings.check(config)
     config.scene.ready()
-    run = Run.open(config.folder) if config.resume else Run.create(config)
+    run = opened(config) if team.leads else Follower(config.folder, config)
     with run.lock():
-        learn(run, config)
+        learn(run, config, team)
     return run
 
 
-def learn(run: Run, config: Config) -> None:
+def opened(config: Config) -> Run:
+    """The run directory: an existing one to go on in, or a new one."""
+    return Run.open(config.folder) if config.resume else Run.create(config)
+
+
+def learn(run: Run, config: Config, team: Team) -> None:
     """The training loop."""
     expert = dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN)
     learner = config.learner(dataset.statistics(config.scene, expert))
-    state, update, before = begin(run, learner, config)
-    test = Tests(config, learner)
-    chunks, data = functools.cache(functools.partial(compiled_chunk, learner)), dataset.without_truth(expert)
+    grid = devices(config, learner)
+    state, update, before = begin_together(run, learner, config, team)
+    state, data = grid.by_seed(state), grid.everywhere(dataset.without_truth(expert))
+    test, chunks = Tests(config, learner, grid), functools.cache(lambda length: compiled_chunk(learner, length, grid))
     started = time.perf_counter() - before
-    with Reporter(run, config, update) as report, Interruption() as interrupted:
+    with reporting(run, config, update, team) as report, Interruption() as interrupted:
         while update < config.updates:
             length = min(config.every.log, config.updates - update)
             state, seen = chunks(length)(state, data)
             update += length
             line: dict[str, Any] = {"update": update, "wall_s": time.perf_counter() - started, "env_steps": env_steps(learner, update)}
-            line |= as_lists(seen)
+            line |= as_lists(grid.gathered(seen))
             check_finite(line, run)
             if update % config.every.test == 0 or update == config.updates:
                 line |= test(state)
             run.log(line)  # before the checkpoint: what a crash leaves without one is written again
-            if update % config.every.save == 0 or update == config.updates or interrupted:
-                run.save(update, state, line["wall_s"])
+            stop = any(team.exchange(bool(interrupted)))
+            if update % config.every.save == 0 or update == config.updates or stop:
+                run.save(update, grid.gathered(state), line["wall_s"])
             report(line)
-            if interrupted:
+            if stop:
+                team.exchange(None)  # the checkpoint is there
                 raise KeyboardInterrupt
+
+
+def devices(config: Config, learner: Learner) -> Grid:
+    """Where the training runs: on all devices of all processes, or on those of this machine that the work divides among.
+
+    Raises:
+        UsageError: the work does not divide among as many devices as there must be.
+    """
+    there = jax.devices()
+    wanted = len(there) if config.hardware.distributed else config.hardware.devices
+    found = sharding.grid(there, config.seeds, [learner.size(b) for b in learner.method.branches], wanted)
+    used = found.mesh.size if found.mesh else 1
+    if used < (wanted or len(there)):
+        sys.stderr.write(f"{used} of {len(there)} devices are used: seeds and minibatch do not divide among more\n")
+    return found
+
+
+def begin_together(run: Run, learner: Learner, config: Config, team: Team) -> tuple[TrainState, int, float]:
+    """What `begin` finds in the first process, in all of them."""
+    if team.leads:
+        state, update, before = begin(run, learner, config)
+    else:
+        shapes = start_shapes(learner, config.all_seeds)
+        state, update, before = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes), 0, 0.0
+    update, before = team.of_first((update, before))
+    return sharding.of_first(state), update, before
 
 
 def begin(run: Run, learner: Learner, config: Config) -> tuple[TrainState, int, float]:
@@ -80,11 +125,16 @@ def begin(run: Run, learner: Learner, config: Config) -> tuple[TrainState, int, 
     return state, update, wall
 
 
+def reporting(run: Run, config: Config, update: int, team: Team) -> contextlib.AbstractContextManager[Callable[[dict[str, Any]], None]]:
+    """What shows each line of metrics: a `Reporter`, and in other processes than the first nothing."""
+    return Reporter(run, config, update) if team.leads else contextlib.nullcontext(lambda line: None)
+
+
 class Tests:
     """The scene's metrics on test episodes, under every source of types."""
 
-    def __init__(self, config: Config, learner: Learner) -> None:
-        self.config, self.roll = config, evaluate.roller(learner, config.scene.samples)
+    def __init__(self, config: Config, learner: Learner, grid: Grid) -> None:
+        self.config, self.grid, self.roll = config, grid, evaluate.roller(learner, config.scene.samples, grid=grid)
         demonstrations = dataset.demonstrations(config.scene, config.experts.test, dataset.TEST)
         self.expert = evaluate.expert_features(config.scene, demonstrations)
         self.episodes = dataset.without_truth(demonstrations)
@@ -92,7 +142,7 @@ class Tests:
 
     def __call__(self, state: TrainState) -> dict[str, list[float]]:
         """Metrics by name; those under other types than the prior's are prefixed."""
-        features = self.roll(state.networks, self.episodes, self.donors, stream("evaluation", 0))
+        features = self.roll(self.grid.gathered(state.networks), self.episodes, self.donors, stream("evaluation", 0))
         scores = evaluate.score(self.config, features, self.expert)
         named = {source: f"{source}/" if source != "prior" else "" for source in scores}
         return {named[source] + name: values for source, table in scores.items() for name, values in table.items()}
@@ -110,13 +160,13 @@ def as_lists(seen: dict[str, jax.Array]) -> dict[str, list[float]]:
 
 
 def check_finite(line: dict[str, Any], run: Run) -> None:
-    """Raises RunError where a seed has diverged: going on would only write NaN."""
+    """Raises DivergedError where a seed has diverged: going on would only write NaN."""
     bad = [(name, seed) for name, x in line.items() if isinstance(x, list) for seed, v in enumerate(x) if not math.isfinite(v)]
     if bad:
         name, seed = bad[0]
         whole = next(run.checkpoints(), None)
         kept = f"the last checkpoint is of update {whole}" if whole is not None else "there is no checkpoint yet"
-        raise RunError(
+        raise DivergedError(
             f"update {line['update']}: {name} of seed {seed} is not finite; {kept}; a new run with a lower learning rate may do better"
         )
 
@@ -150,8 +200,17 @@ def main(argv: Sequence[str] | None = None) -> None:
     argv = sys.argv[1:] if argv is None else argv
     config = settings.from_command_line(argv, "python -m rtc_mjx.train")
     cache.keep_compiled()
-    run = train(config)
-    evaluate.main(["--run", str(run.folder)])
+    with joined(config.hardware, agreed(config)) as team:
+        run = train(config, team)
+        if team.leads:
+            evaluate.main(["--run", str(run.folder)])
+
+
+def agreed(config: Config) -> dict[str, Any]:
+    """What must be the same in all processes that train together: settings, package versions, and this package's code."""
+    options = {f"--{name.replace('_', '-')}": value for name, value in settings.flat(settings.to_dict(config)).items()}
+    where = {"--run": str(config.folder), "--resume": config.resume}
+    return {**options, **where, **cache.versions()}
 
 
 if __name__ == "__main__":

@@ -126,7 +126,7 @@ def test_a_study_that_was_stopped_ends_like_one_that_was_not(tmp_path, monkeypat
         assert whole["metrics"] == stopped["metrics"] and whole["types"] == stopped["types"]
     assert (tmp_path / "whole/double_goal/table.md").read_text() == (tmp_path / "stopped/double_goal/table.md").read_text()
     assert (tmp_path / "whole/double_goal/curves.png").is_file()
-    monkeypatch.setattr(train, "train", lambda config: pytest.fail("what is finished was trained again"))
+    monkeypatch.setattr(train, "train", lambda *_: pytest.fail("what is finished was trained again"))
     monkeypatch.setattr(evaluate, "main", lambda argv: pytest.fail("what is finished was evaluated again"))
     begin("whole", "bc,mgail")
     with pytest.raises(UsageError, match=r"--seeds 3.*has 2"):
@@ -137,10 +137,10 @@ def test_a_study_that_was_stopped_ends_like_one_that_was_not(tmp_path, monkeypat
 def test_one_training_that_diverges_does_not_stop_the_others(tmp_path, monkeypatch):
     really = study.complete
 
-    def complete(entry, scene, folder):
+    def complete(entry, scene, folder, team):
         if entry.name == "bc":
             raise RunError("update 2: reconstruction of seed 0 is not finite")
-        return really(entry, scene, folder)
+        return really(entry, scene, folder, team)
 
     monkeypatch.setattr(study, "complete", complete)
     out = tmp_path / "double_goal"
