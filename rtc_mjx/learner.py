@@ -8,6 +8,8 @@
 The policy's networks are held fixed *inside* the simulation loop; the gradient by its outputs at each step, which carries all that a
 step causes later, is applied to the networks afterwards. The sum is the same gradient as going through the loop with them, at
 a fraction of the cost, and each trajectory's share can be inspected before it counts.
+
+Rows are agents: an episode with several of them is simulated once and makes a row each (`rtc_mjx.scenes.several`).
 """
 
 import functools
@@ -30,7 +32,7 @@ from rtc_mjx.models import Agent, ModelOptions, Networks, Statistics, make_netwo
 from rtc_mjx.physics import OneStep
 from rtc_mjx.pytree import pytree
 from rtc_mjx.rollout import GradientMode, rollout
-from rtc_mjx.scenes import Scene
+from rtc_mjx.scenes import Scene, crew, merged, parted
 from rtc_mjx.trajectory import Demonstration, Episode, Trajectory
 
 
@@ -104,13 +106,25 @@ class Learner:
         return tuple(name for name in branch.losses if name != "reconstruction" or self.scene.reconstructs_rollouts)
 
     def part(self, branch: Branch, batch: Demonstration) -> Demonstration:
-        """A branch's rows of the minibatch."""
+        """A branch's episodes of the minibatch, a row for each agent."""
         rows = self.rows(branch)
-        return jax.tree.map(lambda x: x[rows], batch)
+        return self.by_agent(jax.tree.map(lambda x: x[rows], batch))
+
+    def by_agent(self, batch: Demonstration) -> Demonstration:
+        """Joint demonstrations as rows of single agents'."""
+        return merged(self.scene, jax.vmap(self.scene.views)(batch))
+
+    def types(self, source: str, agent: Agent, demonstration: Demonstration, key: Array) -> Typed:
+        """Types of the agents of one episode, from a source of `agent_types.SOURCES`."""
+        draw = self.scene.each(functools.partial(SOURCES[source], agent))
+        return draw(self.scene.views(demonstration), self.scene.key_each(key))
 
     def play(self, agent: Agent, episode: Episode, agent_type: Array, key: Array, nudge: Array | None = None) -> Trajectory:
-        """One rollout of the policy under one type, with `nudge` (T, outputs) added to its outputs to differentiate by."""
-        options, actor = self.optimiser, agent.actor(agent_type, key, nudge)
+        """One rollout of the policy under one type, with `nudge` (T, outputs) added to its outputs to differentiate by.
+
+        Of several agents types, keys and nudges have a leading axis, and the trajectory is joint.
+        """
+        options, actor = self.optimiser, crew(self.scene, self.scene.each(agent.actor)(agent_type, key, nudge))
         return rollout(self.scene, actor, episode, gradient=options.gradient, decay=options.decay, one_step=self.one_step)
 
 
@@ -274,7 +288,8 @@ def play_together(learner: Learner, agent: Agent, batch: Demonstration, typed: l
     keys = random.split(key, len(g))
 
     def play(nudge: Array) -> Trajectory:
-        return jax.vmap(functools.partial(learner.play, agent))(episodes, g, keys, nudge)
+        joint = jax.vmap(functools.partial(learner.play, agent))(episodes, *parted(learner.scene, (g, keys, nudge)))
+        return merged(learner.scene, jax.vmap(learner.scene.apart)(joint))
 
     tracks, back = jax.vjp(play, jnp.zeros((len(g), learner.scene.steps, agent.outputs)))
     finite = [jnp.all(jnp.isfinite(x), axis=tuple(range(1, x.ndim))) for x in jax.tree.leaves(tracks)]
@@ -306,7 +321,8 @@ def critic_loss(learner: Learner, agent: Agent, batch: Demonstration, played: Pl
     """The discriminator's loss on demonstrations and on the rollouts of all branches, at random times; and its accuracies."""
     steps = learner.scene.steps
     times = random.permutation(key, steps)[: learner.optimiser.discriminator_steps or steps]
-    real, fake = (lax.stop_gradient((t.observations[:, times], t.actions[:, times])) for t in (batch.trajectory, played.tracks))
+    tracks = (learner.by_agent(batch).trajectory, played.tracks)
+    real, fake = (lax.stop_gradient((t.observations[:, times], t.actions[:, times])) for t in tracks)
     real_logit, fake_logit = jax.vmap(agent.logit)(*real), jax.vmap(agent.logit)(*fake)
     entropy = jnp.mean(jax.nn.softplus(-real_logit)) + _mean(jnp.mean(jax.nn.softplus(fake_logit), axis=1), played.alive)
     penalty = gradient_penalty(agent, *real)
@@ -321,7 +337,8 @@ def critic_loss(learner: Learner, agent: Agent, batch: Demonstration, played: Pl
 
 def branch_sizes(learner: Learner) -> Int[np.ndarray, "rows"]:
     """For each rollout of an update, the number of rollouts that its branch's means are over."""
-    sizes = [rows.stop - rows.start for rows in (learner.rows(b) for b in learner.method.branches if b.closed_loop)]
+    slices = [learner.rows(b) for b in learner.method.branches if b.closed_loop]
+    sizes = [learner.scene.agents * (rows.stop - rows.start) for rows in slices]
     return np.repeat(sizes, sizes)
 
 

@@ -1,6 +1,7 @@
 """A ramp that joins a road, generated: the agent comes down the ramp, finds a gap, and later stays on the road or leaves it.
 
-External, xi: who drives on the road, how fast and how far apart. Internal to the expert: its speed, its gap, whether it leaves.
+External, xi: who drives on the road, how fast and how far apart. Internal to the expert: its speed, its gap, whether it leaves. Where
+two cars are driven, the other one is on the road, and comes to where the ramp joins.
 """
 
 from dataclasses import dataclass
@@ -9,12 +10,12 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 from jax import random
-from jaxtyping import Array
+from jaxtyping import Array, Int
 
 from rtc_mjx.geometry import resample
 from rtc_mjx.logs import NO_SIGNAL, VEHICLE, LoggedScene, RoadGraph
-from rtc_mjx.scenes.driving import CAR
-from rtc_mjx.scenes.generated import Generated, Others, assemble, moving
+from rtc_mjx.physics.car import CAR
+from rtc_mjx.scenes.generated import Generated, Traffic, assemble, moving
 from rtc_mjx.scenes.roads import POINTS, as_segments, beside, bezier, straight, thinned
 from rtc_mjx.scenes.routes import RouteOptions
 from rtc_mjx.scenes.traffic import Drivers, drive, nothing_to_stop_for
@@ -27,6 +28,7 @@ RAMP, ROAD = 90.0, 160.0  # m
 BACK = (6.0, 32.0)  # m, the agent's nose from the give-way line at t = 0
 SPEED = (10.0, 13.0)  # m/s, what drivers want on a free road
 FLOW = (7.5, 10.0)  # m/s, of the road
+UPSTREAM_OF = 25.0  # m, from where the ramp has joined, beyond which whoever is next on the road is still to come there
 UPSTREAM, RAMP_LANE, JOINING, BETWEEN, ONWARD, LEAVING = range(6)
 
 
@@ -37,9 +39,11 @@ class Merge(Generated):
     Attributes:
         steps: T, the number of control steps of 0.3 s in an episode.
         road_users: bodies for replayed road users; the nearest are kept.
+        controlled: cars that are driven, each by an agent with a type of its own; the road users are replayed.
     """
 
     name: ClassVar[str] = "merge"
+    room: ClassVar[int] = 2
     speeds: ClassVar[tuple[float, float]] = SPEED
     settings: ClassVar[str] = "intersection"
     route_options: ClassVar[RouteOptions] = RouteOptions(count=2, lanes=4)
@@ -55,7 +59,10 @@ class Merge(Generated):
         end = road.lanes[RAMP_LANE, -1]
         pose = jnp.concatenate([end - back * jnp.stack([jnp.cos(angle), jnp.sin(angle)]), angle[None]])
         signals = jnp.full((times, road.lanes.shape[0]), NO_SIGNAL)
-        return assemble(road, signals, pose, speed, traffic(who, road, times), times)
+        others, taken = traffic(who, road, times), jnp.zeros(0, int)
+        if self.controlled > 1:
+            others, taken = up_to_the_next(others)
+        return assemble(road, signals, pose, speed, others, taken, times)
 
 
 def ramp(angle: Array) -> RoadGraph:
@@ -81,7 +88,14 @@ def ramp(angle: Array) -> RoadGraph:
     return RoadGraph(lanes, successors, jnp.array([0, 0, 2, 0, 0, 0]), edges, jnp.ones(len(edges), bool), jnp.zeros((1, 4, 2)))
 
 
-def traffic(key: jax.Array, road: RoadGraph, times: int) -> Others:
+def up_to_the_next(traffic: Traffic) -> tuple[Traffic, Int[Array, "1"]]:
+    """The traffic without those behind the next who comes to where the ramp joins, and which one that is."""
+    poses, velocities, sizes, kinds = traffic
+    following = jnp.argmax(poses[:, 0, 0] < -UPSTREAM_OF)  # they drive along x, the first is ahead
+    return (poses, velocities, sizes, jnp.where(jnp.arange(len(kinds)) > following, 0, kinds)), following[None]
+
+
+def traffic(key: jax.Array, road: RoadGraph, times: int) -> Traffic:
     """Poses, velocities, sizes and kinds of a line of vehicles on the road."""
     keys = iter(random.split(key, 7))
     count = 6
