@@ -118,7 +118,7 @@ def test_cars_sent_at_each_other_collide_and_the_gradient_goes_through(x64):
         assert np.isclose(slope[step, car, control], difference, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", GENERATED)
+@pytest.mark.parametrize("name", [name for name in GENERATED if SCENES[name].room > 1])
 def test_cars_start_on_ways_of_their_own_clear_of_everybody(name):
     scene = SCENES[name](controlled=SCENES[name].room)
 
@@ -233,8 +233,8 @@ def test_min_ade_is_each_agents_own_best_sample():
         ("intersection", 0, "from 1 to 4"),
         ("intersection", 99, "from 1 to 4"),
         ("roundabout", 5, "from 1 to 4"),
-        ("merge", 3, "from 1 to 2"),
-        ("womd", 5, "from 1 to 4"),
+        ("merge", 2, "one car is driven"),
+        ("womd", 2, "one car is driven, everybody else is replayed"),
     ],
 )
 def test_numbers_of_cars_without_room_are_refused(scene, cars, why):

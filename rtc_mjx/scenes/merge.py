@@ -1,7 +1,7 @@
 """A ramp that joins a road, generated: the agent comes down the ramp, finds a gap, and later stays on the road or leaves it.
 
-External, xi: who drives on the road, how fast and how far apart. Internal to the expert: its speed, its gap, whether it leaves. Where
-two cars are driven, the other one is on the road, and comes to where the ramp joins.
+External, xi: who drives on the road, how fast and how far apart. Internal to the expert: its speed, its gap, whether it leaves. One
+car is driven: no expert on the road would make way for another one that joins.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 from jax import random
-from jaxtyping import Array, Int
+from jaxtyping import Array
 
 from rtc_mjx.geometry import resample
 from rtc_mjx.logs import NO_SIGNAL, VEHICLE, LoggedScene, RoadGraph
@@ -28,7 +28,6 @@ RAMP, ROAD = 90.0, 160.0  # m
 BACK = (6.0, 32.0)  # m, the agent's nose from the give-way line at t = 0
 SPEED = (10.0, 13.0)  # m/s, what drivers want on a free road
 FLOW = (7.5, 10.0)  # m/s, of the road
-UPSTREAM_OF = 25.0  # m, from where the ramp has joined, beyond which whoever is next on the road is still to come there
 UPSTREAM, RAMP_LANE, JOINING, BETWEEN, ONWARD, LEAVING = range(6)
 
 
@@ -39,11 +38,10 @@ class Merge(Generated):
     Attributes:
         steps: T, the number of control steps of 0.3 s in an episode.
         road_users: bodies for replayed road users; the nearest are kept.
-        controlled: cars that are driven, each by an agent with a type of its own; the road users are replayed.
+        controlled: one; everybody else is replayed.
     """
 
     name: ClassVar[str] = "merge"
-    room: ClassVar[int] = 2
     speeds: ClassVar[tuple[float, float]] = SPEED
     settings: ClassVar[str] = "intersection"
     route_options: ClassVar[RouteOptions] = RouteOptions(count=2, lanes=4)
@@ -59,10 +57,7 @@ class Merge(Generated):
         end = road.lanes[RAMP_LANE, -1]
         pose = jnp.concatenate([end - back * jnp.stack([jnp.cos(angle), jnp.sin(angle)]), angle[None]])
         signals = jnp.full((times, road.lanes.shape[0]), NO_SIGNAL)
-        others, taken = traffic(who, road, times), jnp.zeros(0, int)
-        if self.controlled > 1:
-            others, taken = up_to_the_next(others)
-        return assemble(road, signals, pose, speed, others, taken, times)
+        return assemble(road, signals, pose, speed, traffic(who, road, times), jnp.zeros(0, int), times)
 
 
 def ramp(angle: Array) -> RoadGraph:
@@ -86,13 +81,6 @@ def ramp(angle: Array) -> RoadGraph:
     left = jnp.concatenate([lanes[UPSTREAM], lanes[BETWEEN][1:], lanes[ONWARD][1:]])[::-1]
     edges = jnp.concatenate([as_segments(thinned(beside(line, jnp.array(-WIDTH / 2)), 49)) for line in (right, left)])
     return RoadGraph(lanes, successors, jnp.array([0, 0, 2, 0, 0, 0]), edges, jnp.ones(len(edges), bool), jnp.zeros((1, 4, 2)))
-
-
-def up_to_the_next(traffic: Traffic) -> tuple[Traffic, Int[Array, "1"]]:
-    """The traffic without those behind the next who comes to where the ramp joins, and which one that is."""
-    poses, velocities, sizes, kinds = traffic
-    following = jnp.argmax(poses[:, 0, 0] < -UPSTREAM_OF)  # they drive along x, the first is ahead
-    return (poses, velocities, sizes, jnp.where(jnp.arange(len(kinds)) > following, 0, kinds)), following[None]
 
 
 def traffic(key: jax.Array, road: RoadGraph, times: int) -> Traffic:
