@@ -207,7 +207,7 @@ def test_every_kind_of_method_takes_several_agents(method):
 
 def test_several_experts_arrive_without_accident():
     """As one expert does; they take the routes that they have in mind, each its own, and Symphony's labels say so."""
-    scene = Intersection(controlled=2)
+    scene = Intersection(road_users=2, controlled=2)
     held = jax.jit(jax.vmap(lambda key: dataset.demonstrate(scene, key)))(random.split(random.key(5), 256))
     features = jax.jit(jax.vmap(lambda one: scene.features(one, one.trajectory)))(dataset.without_truth(held))
     assert features["collision"].shape == (256, 2)
