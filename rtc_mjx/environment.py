@@ -1,6 +1,7 @@
 """A scene as a `dm_env.Environment`, so that dm_control's viewer and any dm_env loop can live in it.
 
-Physics are MJX's, as in training; a dm_control `Physics` of the same model is kept in step, for viewers and pixels.
+Physics are MJX's, as in training; a dm_control `Physics` of the same model is kept in step, for viewers and pixels. Where a scene has
+several agents, observations, actions and rewards have a leading axis of agents.
 """
 
 import functools
@@ -37,7 +38,7 @@ class Environment(dm_env.Environment):
         self._look = jax.jit(lambda episode, time, state: (scene.observe(episode, time, state), scene.reward(episode, time, state)))
         self._advance = jax.jit(
             lambda episode, time, state, action: advance(
-                state, action, *(jax.tree.map(lambda x, at=at: x[at], episode.surroundings) for at in (time, time + 1))
+                state, action.reshape(-1), *(jax.tree.map(lambda x, at=at: x[at], episode.surroundings) for at in (time, time + 1))
             )
         )
 
@@ -78,19 +79,26 @@ class Environment(dm_env.Environment):
 
     def observation_spec(self) -> specs.Array:
         """The scene's observation, unbounded."""
-        return specs.Array(self._shape, np.float32, name="observation")
+        return specs.Array(self._shapes[0], np.float32, name="observation")
 
     def action_spec(self) -> specs.BoundedArray:
         """The scene's controls with their range."""
         (low, high), names = self._scene.control_range.astype(np.float32).T, self._scene.world.control_names
-        return specs.BoundedArray(low.shape, np.float32, low, high, name=" ".join(names))
+        shape = (*self._shapes[1], self._scene.controls)
+        return specs.BoundedArray(shape, np.float32, low.reshape(shape), high.reshape(shape), name=" ".join(names))
+
+    def reward_spec(self) -> specs.Array:
+        """The scene's reward, a number an agent."""
+        return specs.Array(self._shapes[1], float, name="reward")
 
     @functools.cached_property
-    def _shape(self) -> tuple[int, ...]:
+    def _shapes(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Of an observation and of a reward."""
         episode = jax.eval_shape(self._scene.reset, jax.random.key(0))
-        return jax.eval_shape(self._scene.observe, episode, jnp.array(0), episode.start).shape
+        seen, reward = jax.eval_shape(self._look, episode, jnp.array(0), episode.start)
+        return seen.shape, reward.shape
 
-    def _enter(self, episode: Episode, time: int, state: PhysicsState) -> tuple[np.ndarray, float]:
+    def _enter(self, episode: Episode, time: int, state: PhysicsState) -> tuple[np.ndarray, Any]:
         """Makes a state the current one, dm_control's physics included; returns its observation and reward."""
         self._now = (episode, time, state)
         data = self._physics.data
@@ -99,4 +107,4 @@ class Environment(dm_env.Environment):
             place_surroundings(data, np.asarray(episode.surroundings.pose[time]))
             data.time = time * self.control_timestep()
         observation, reward = self._look(episode, time, state)
-        return np.asarray(observation, np.float32), float(reward)
+        return np.asarray(observation, np.float32), np.asarray(reward, float)[()]

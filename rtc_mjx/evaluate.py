@@ -24,7 +24,6 @@ from rich.console import Console
 from rich.table import Table
 
 from rtc_mjx import cache, cli, dataset, metrics
-from rtc_mjx.agent_types import SOURCES
 from rtc_mjx.challenge import challenge
 from rtc_mjx.config import Config
 from rtc_mjx.errors import RunError, UsageError
@@ -66,6 +65,8 @@ def elsewhere(held: Any) -> Any:
 def roller(learner: Learner, samples: int, watch: Watch = iter, grid: Grid = ONE_DEVICE) -> Roll:
     """A function (networks, test demonstrations, donors, key) -> features per type source, as numpy arrays (seeds, samples, episodes).
 
+    Where several agents act in an episode, an axis of agents follows.
+
     Args:
         learner: who is tested; the networks are those of all seeds.
         samples: rollouts of each episode, every one with a type of its own.
@@ -76,9 +77,10 @@ def roller(learner: Learner, samples: int, watch: Watch = iter, grid: Grid = ONE
     def one(networks: Networks, mine: Demonstration, given: Donors, key: Array) -> dict[str, dict[str, Array]]:
         agent = learner.agent(networks)
         draw, noise = random.split(key)
-        types = {"prior": SOURCES[learner.method.test_types](agent, mine, draw)}
-        types |= {name: SOURCES["encoder"](agent, Demonstration(mine.episode, track, ()), draw) for name, track in given.items()}
-        tracks = {name: learner.play(agent, mine.episode, typed.agent_type, noise) for name, typed in types.items()}
+        types = {"prior": learner.types(learner.method.test_types, agent, mine, draw)}
+        types |= {name: learner.types("encoder", agent, Demonstration(mine.episode, track, ()), draw) for name, track in given.items()}
+        keys = learner.scene.key_each(noise)
+        tracks = {name: learner.play(agent, mine.episode, typed.agent_type, keys) for name, typed in types.items()}
         return {name: learner.scene.features(mine, track) | {FINITE: _finite(track)} for name, track in tracks.items()}
 
     def several(networks: Networks, held: tuple[Demonstration, Donors, Array]) -> dict[str, dict[str, Array]]:
@@ -189,7 +191,7 @@ def reaction(
     def told(before: np.ndarray, after: np.ndarray) -> dict[str, float]:
         return {"as_it_was": float(np.mean(before)), "flipped": float(np.mean(after)), "like_expert": float(np.mean(after == theirs))}
 
-    ours = {source: told(features[source]["decided"][..., :count], flipped[source]["decided"]) for source in features}
+    ours = {source: told(features[source]["decided"][:, :, :count], flipped[source]["decided"]) for source in features}
     return ours | {"expert": told(before, theirs)}
 
 

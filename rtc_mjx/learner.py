@@ -8,6 +8,8 @@
 The policy's networks are held fixed *inside* the simulation loop; the gradient by its outputs at each step, which carries all that a
 step causes later, is applied to the networks afterwards. The sum is the same gradient as going through the loop with them, at
 a fraction of the cost, and each trajectory's share can be inspected before it counts.
+
+Rows are agents: an episode with several of them is simulated once and makes a row each (`rtc_mjx.scenes.several`).
 """
 
 import dataclasses
@@ -31,7 +33,7 @@ from rtc_mjx.models import Agent, ModelOptions, Networks, Statistics, make_netwo
 from rtc_mjx.physics import OneStep
 from rtc_mjx.pytree import pytree
 from rtc_mjx.rollout import GradientMode, rollout
-from rtc_mjx.scenes import Scene
+from rtc_mjx.scenes import Scene, crew, merged, parted
 from rtc_mjx.sharding import ALL_ROWS, ONE_DEVICE, Grid, Rows
 from rtc_mjx.trajectory import Demonstration, Episode, Trajectory
 
@@ -79,7 +81,7 @@ class Learner:
         batch: episodes of a minibatch.
         encoder_share: the paper's f.
         one_step: physics in place of the scene's own.
-        shared: how the rows of the minibatch are shared out among devices.
+        shared: how the episodes of the minibatch are shared out among devices.
     """
 
     scene: Scene
@@ -100,11 +102,11 @@ class Learner:
         return Agent(networks, self.statistics, self.model, self.space, self.scene)
 
     def rows(self, branch: Branch) -> slice:
-        """The rows of the minibatch that a branch takes."""
+        """The episodes of the minibatch that a branch takes."""
         return branch.rows(self.batch, self.encoder_share)
 
     def size(self, branch: Branch) -> int:
-        """The number of these rows, on all devices together."""
+        """The number of these episodes, on all devices together."""
         rows = self.rows(branch)
         return rows.stop - rows.start
 
@@ -118,13 +120,30 @@ class Learner:
         return tuple(name for name in branch.losses if name != "reconstruction" or self.scene.reconstructs_rollouts)
 
     def part(self, branch: Branch, batch: Demonstration) -> Demonstration:
-        """A branch's rows of the minibatch, as far as this device has them."""
+        """A branch's episodes of the minibatch, as far as this device has them, a row for each agent."""
         rows = self.rows(branch)
-        return self.shared.mine(jax.tree.map(lambda x: x[rows], batch), self.size(branch))
+        return self.by_agent(self.shared.mine(jax.tree.map(lambda x: x[rows], batch), self.size(branch)))
+
+    def by_agent(self, batch: Demonstration) -> Demonstration:
+        """Joint demonstrations as rows of single agents'."""
+        return merged(self.scene, jax.vmap(self.scene.views)(batch))
+
+    def keys(self, key: Array, *sizes: int) -> Array:
+        """A key for each of this device's rows, of branches with so many episodes."""
+        keys = random.split(key, self.scene.agents * sum(sizes))
+        return merged(self.scene, self.shared.mine(parted(self.scene, keys), *sizes))
+
+    def types(self, source: str, agent: Agent, demonstration: Demonstration, key: Array) -> Typed:
+        """Types of the agents of one episode, from a source of `agent_types.SOURCES`."""
+        draw = self.scene.each(functools.partial(SOURCES[source], agent))
+        return draw(self.scene.views(demonstration), self.scene.key_each(key))
 
     def play(self, agent: Agent, episode: Episode, agent_type: Array, key: Array, nudge: Array | None = None) -> Trajectory:
-        """One rollout of the policy under one type, with `nudge` (T, outputs) added to its outputs to differentiate by."""
-        options, actor = self.optimiser, agent.actor(agent_type, key, nudge)
+        """One rollout of the policy under one type, with `nudge` (T, outputs) added to its outputs to differentiate by.
+
+        Of several agents types, keys and nudges have a leading axis, and the trajectory is joint.
+        """
+        options, actor = self.optimiser, crew(self.scene, self.scene.each(agent.actor)(agent_type, key, nudge))
         return rollout(self.scene, actor, episode, gradient=options.gradient, decay=options.decay, one_step=self.one_step)
 
 
@@ -198,7 +217,7 @@ def compiled_chunk(learner: Learner, length: int, grid: Grid = ONE_DEVICE) -> ja
     On a CPU one seed already fills the matrix units, and all seeds' activations together would not fit its caches: there seeds take
     turns within the program. Elsewhere they are one more axis.
     """
-    learner = dataclasses.replace(learner, shared=grid.rows)
+    learner = dataclasses.replace(learner, shared=dataclasses.replace(grid.rows, agents=learner.scene.agents))
 
     def all_seeds(states: TrainState, expert: Demonstration) -> tuple[TrainState, dict[str, Array]]:
         def one_seed(state: TrainState) -> tuple[TrainState, dict[str, Array]]:
@@ -249,7 +268,7 @@ def infer(learner: Learner, agent: Agent, batch: Demonstration, key: Array) -> l
     typed = []
     for index, branch in enumerate(learner.method.branches):
         mine = learner.part(branch, batch)
-        keys = learner.shared.mine(random.split(random.fold_in(key, index), learner.size(branch)), learner.size(branch))
+        keys = learner.keys(random.fold_in(key, index), learner.size(branch))
         typed.append(jax.vmap(functools.partial(SOURCES[branch.types], agent))(mine, keys))
     return typed
 
@@ -286,10 +305,11 @@ def play_together(learner: Learner, agent: Agent, batch: Demonstration, typed: l
         return None, lambda tracks: tracks.actions
     episodes = learner.shared.mine(jax.tree.map(lambda x: x[np.concatenate(rows)], batch.episode), *sizes)
     g = joined_types(learner, typed)
-    keys = learner.shared.mine(random.split(key, sum(sizes)), *sizes)
+    keys = learner.keys(key, *sizes)
 
     def play(nudge: Array) -> Trajectory:
-        return jax.vmap(functools.partial(learner.play, agent))(episodes, g, keys, nudge)
+        joint = jax.vmap(functools.partial(learner.play, agent))(episodes, *parted(learner.scene, (g, keys, nudge)))
+        return merged(learner.scene, jax.vmap(learner.scene.apart)(joint))
 
     tracks, back = jax.vjp(play, jnp.zeros((len(g), learner.scene.steps, agent.outputs)))
     finite = [jnp.all(jnp.isfinite(x), axis=tuple(range(1, x.ndim))) for x in jax.tree.leaves(tracks)]
@@ -313,7 +333,7 @@ def branch_losses(
         if branch.closed_loop:
             part = jax.tree.map(lambda x, a=first, n=count: x[a : a + n], played)
             first += count
-        cases = Case(mine, types, part.tracks, learner.shared.mine(random.split(key, learner.size(branch)), learner.size(branch)))
+        cases = Case(mine, types, part.tracks, learner.keys(key, learner.size(branch)))
         for name in (n for n in learner.losses(branch) if n in names):
             each = jax.vmap(lambda case, loss=LOSSES[name]: loss(agent, case, learner.weights))(cases)
             counts = part.alive if name in CLOSED_LOOP else learner.shared.counting(jnp.ones(count, bool), learner.size(branch))
@@ -325,7 +345,7 @@ def critic_loss(learner: Learner, agent: Agent, batch: Demonstration, played: Pl
     """The discriminator's loss on demonstrations and on the rollouts of all branches, at random times; and its accuracies."""
     steps = learner.scene.steps
     times = random.permutation(key, steps)[: learner.optimiser.discriminator_steps or steps]
-    shared, tracks = learner.shared, (learner.shared.mine(batch.trajectory, learner.batch), played.tracks)
+    shared, tracks = learner.shared, (learner.by_agent(learner.shared.mine(batch, learner.batch)).trajectory, played.tracks)
     real, fake = (lax.stop_gradient((t.observations[:, times], t.actions[:, times])) for t in tracks)
     real_logit, fake_logit = jax.vmap(agent.logit)(*real), jax.vmap(agent.logit)(*fake)
     on_real = shared.mean_of(lambda logit: jnp.mean(jax.nn.softplus(-logit)), real_logit, learner.batch)
@@ -342,8 +362,8 @@ def critic_loss(learner: Learner, agent: Agent, batch: Demonstration, played: Pl
 
 def branch_sizes(learner: Learner) -> Int[np.ndarray, "rows"]:
     """For each rollout that this device makes in an update, the number of rollouts that its branch's means are over."""
-    sizes = [learner.size(b) for b in learner.closed_loop]
-    return np.repeat(sizes, [learner.shared.count(size) for size in sizes])
+    sizes, agents = [learner.size(b) for b in learner.closed_loop], learner.scene.agents
+    return np.repeat([agents * size for size in sizes], [agents * learner.shared.count(size) for size in sizes])
 
 
 def guard(

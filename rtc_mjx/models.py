@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import nnx
+from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
 from rtc_mjx.agent_types import TypeSpace, mixture_of
@@ -100,19 +101,19 @@ class Agent:
     @property
     def outputs(self) -> int:
         """How many numbers the policy puts out."""
-        return output_count(self.options, len(self.scene.world.control_ids))
+        return output_count(self.options, self.scene.controls)
 
     def actor(self, agent_type: Array, key: Array, nudge: Array | None = None) -> Actor:
         """The policy under one type, with the noise of T actions; `nudge` (T, outputs) is added to its outputs."""
         draw = self.action_distribution(jnp.zeros(self.outputs)).noise
         nudge = jnp.zeros((self.scene.steps, self.outputs)) if nudge is None else nudge
 
-        def act(memory: tuple[()], observation: Array, given: tuple[Any, Array]) -> tuple[tuple[()], Array]:
+        def act(agent_type: Array, memory: tuple[()], observation: Array, given: tuple[Any, Array]) -> tuple[tuple[()], Array]:
             noise, push = given
             choice = self.action_distribution(self.policy_outputs(observation, agent_type) + push)
             return memory, choice.sample(noise, self.options.choice_gradient)
 
-        return Actor((), act, (jax.vmap(draw)(jax.random.split(key, self.scene.steps)), nudge))
+        return Actor((), Partial(act, agent_type), (jax.vmap(draw)(jax.random.split(key, self.scene.steps)), nudge))
 
     def policy_outputs(self, observation: Array, agent_type: Array) -> Array:
         """The policy network on one observation in the scene's units, or on an array of them, and a type.
@@ -180,7 +181,7 @@ def observation_layout(scene: Scene, features: int, extra: int = 0) -> Layout:
 
 def make_networks(key: Array, scene: Scene, features: int, space: TypeSpace, options: ModelOptions, parts: frozenset[str]) -> Networks:
     """Draws the networks of one seed; `parts` names the optional ones that the method has."""
-    rngs, controls = nnx.Rngs(key), len(scene.world.control_ids)
+    rngs, controls = nnx.Rngs(key), scene.controls
     width, hidden = options.width, [options.width] * options.depth
     pair, alone = observation_layout(scene, features, controls), observation_layout(scene, features)
     typed = dataclasses.replace(alone, extra=space.size)

@@ -2,10 +2,11 @@
 
     run -> rollouts of a few test episodes -> poses of the agent's body -> a world with ghosts and trails -> pictures -> H.264
 
-`python -m rtc_mjx.render --run DIR --out FILE.mp4`. Coloured: the agent, one colour a type; white: the expert in this episode.
+`python -m rtc_mjx.render --run DIR --out FILE.mp4`. Coloured: the agents, one colour a type; white: the experts in this episode.
 """
 
 import argparse
+import itertools
 import logging
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
@@ -21,7 +22,6 @@ from rich.console import Console
 from rich.progress import Progress
 
 from rtc_mjx import cache, cli, dataset
-from rtc_mjx.agent_types import SOURCES
 from rtc_mjx.camera import Picture, camera
 from rtc_mjx.errors import UsageError
 from rtc_mjx.keys import stream
@@ -48,8 +48,8 @@ def rollouts(run: Run, episodes: int, types: int, seed_index: int) -> tuple[Demo
 
     def play(demonstration: Demonstration, key: jax.Array) -> Trajectory:
         draw, noise = random.split(key)
-        g = SOURCES[learner.method.test_types](agent, demonstration, draw).agent_type
-        return learner.play(agent, demonstration.episode, g, noise)
+        g = learner.types(learner.method.test_types, agent, demonstration, draw).agent_type
+        return learner.play(agent, demonstration.episode, g, config.scene.key_each(noise))
 
     keys = random.split(stream("evaluation", 0), (len(jax.tree.leaves(shown)[0]), types))
     inner = jax.vmap(play, in_axes=(None, 0))
@@ -57,32 +57,36 @@ def rollouts(run: Run, episodes: int, types: int, seed_index: int) -> tuple[Demo
 
 
 def stage(scene: Scene, episode: Episode, actors: int, marks: int, size: tuple[int, int]) -> mujoco.MjModel:
-    """The dressed world with marks for trails, and a ghost of the agent for each actor but the first unless shown side by side."""
+    """The dressed world with marks for trails, and ghosts of the agents for each actor but the first unless shown side by side."""
     spec = scene.world.spec.copy()
     spec.visual.global_.offheight, spec.visual.global_.offwidth = size  # of what OpenGL draws into
     scene.dress(spec, episode)
-    original = spec.body(scene.agent_body)
-    for geom in [g for g in original.geoms if not scene.side_by_side or g.name.endswith("/body")]:
+    originals = [spec.body(name) for name in scene.agent_bodies]
+    for geom in [g for body in originals for g in body.geoms if not scene.side_by_side or g.name.endswith("/body")]:
         geom.material, geom.rgba = "", [*EXPERT, 1]
-    for actor in range(actors):
+    for actor, (index, original) in itertools.product(range(actors), enumerate(originals)):
+        paint = [*colour(actor, index, scene.agents), 1]
         if actor and not scene.side_by_side:
-            ghost = spec.worldbody.add_body(name=f"ghost{actor}", mocap=True)
+            ghost = spec.worldbody.add_body(name=f"ghost{actor}_{index}", mocap=True)
             for g in original.geoms:
-                ghost.add_geom(
-                    type=g.type, size=g.size, pos=g.pos, quat=g.quat, group=g.group, rgba=[*colour(actor), 1], contype=0, conaffinity=0
-                )
+                ghost.add_geom(type=g.type, size=g.size, pos=g.pos, quat=g.quat, group=g.group, rgba=paint, contype=0, conaffinity=0)
         for mark in range(marks):
-            dot = spec.worldbody.add_body(name=f"mark{actor}_{mark}", mocap=True, pos=[0, 0, AWAY])
+            dot = spec.worldbody.add_body(name=mark_name(actor, index, mark), mocap=True, pos=[0, 0, AWAY])
             dot.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[scene.mark_size * (1.0 if actor else 0.7)] * 3, rgba=[*colour(actor), 1],
+                type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[scene.mark_size * (1.0 if actor else 0.7)] * 3, rgba=paint,
                 contype=0, conaffinity=0,
             )  # fmt: skip
     return spec.compile()
 
 
-def colour(actor: int) -> tuple[float, float, float]:
-    """White for the expert (actor 0), one of the palette for each type."""
-    return PALETTE[(actor - 1) % len(PALETTE)] if actor else EXPERT
+def mark_name(actor: int, agent: int, mark: int) -> str:
+    """The body of one mark of an agent's trail."""
+    return f"mark{actor}_{agent}_{mark}"
+
+
+def colour(actor: int, agent: int = 0, agents: int = 1) -> tuple[float, float, float]:
+    """White for experts (actor 0), one of the palette for each type: every agent of every other actor has one of its own."""
+    return PALETTE[((actor - 1) * agents + agent) % len(PALETTE)] if actor else EXPERT
 
 
 def poses(world: World, body: str, qpos: np.ndarray) -> tuple[Float[np.ndarray, "times 3"], Float[np.ndarray, "times 4"]]:
@@ -104,7 +108,7 @@ def pictures(run: Run, shown: Demonstration, tracks: Trajectory, camera_name: st
     for index in range(tracks.actions.shape[0]):
         episode = jax.tree.map(lambda x, i=index: np.asarray(x[i]), shown.episode)
         driven = [np.asarray(shown.trajectory.states.qpos[index]), *np.asarray(tracks.states.qpos[index])]
-        paths = [poses(scene.world, scene.agent_body, qpos) for qpos in driven]
+        paths = [[poses(scene.world, body, qpos) for body in scene.agent_bodies] for qpos in driven]
         model = stage(scene, episode, 2 if scene.side_by_side else actors, marks, size)
         data, take = mujoco.MjData(model), camera(model, camera_name, *size)
         for time in range(scene.steps + 1):
@@ -113,7 +117,7 @@ def pictures(run: Run, shown: Demonstration, tracks: Trajectory, camera_name: st
             if scene.side_by_side:
                 shots = []
                 for actor in range(actors):
-                    paint_agent(model, scene.agent_body, marks, actor)
+                    paint_agents(model, scene, marks, actor)
                     _place(model, data, driven[actor][time], around, [paths[0], paths[actor]], time, marks, ghosts=False)
                     shots.append(take(data))
                 picture = np.concatenate(shots, axis=1)
@@ -125,25 +129,27 @@ def pictures(run: Run, shown: Demonstration, tracks: Trajectory, camera_name: st
         take.close()
 
 
-def paint_agent(model: mujoco.MjModel, body: str, marks: int, actor: int) -> None:
-    """Gives the agent's body and its own trail the colour of an actor."""
-    first, count = model.body(body).geomadr[0], model.body(body).geomnum[0]
-    for geom in range(first, first + count):
-        if model.geom(geom).name.endswith("/body"):
-            model.geom_rgba[geom, :3] = colour(actor)
-    for mark in range(marks):
-        model.geom_rgba[model.body(f"mark1_{mark}").geomadr[0], :3] = colour(actor)
+def paint_agents(model: mujoco.MjModel, scene: Scene, marks: int, actor: int) -> None:
+    """Gives the body of each agent and its own trail their colour of an actor."""
+    for index, body in enumerate(scene.agent_bodies):
+        paint = colour(actor, index, scene.agents)
+        first, count = model.body(body).geomadr[0], model.body(body).geomnum[0]
+        for geom in range(first, first + count):
+            if model.geom(geom).name.endswith("/body"):
+                model.geom_rgba[geom, :3] = paint
+        for mark in range(marks):
+            model.geom_rgba[model.body(mark_name(1, index, mark)).geomadr[0], :3] = paint
 
 
 def _place(
-    model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray, around: np.ndarray, paths: Sequence[tuple[np.ndarray, np.ndarray]],
-    time: int, marks: int, ghosts: bool,
+    model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray, around: np.ndarray,
+    paths: Sequence[Sequence[tuple[np.ndarray, np.ndarray]]], time: int, marks: int, ghosts: bool,
 ) -> None:  # fmt: skip
-    """Puts everything where it is at a time."""
+    """Puts everything where it is at a time; `paths` are those of each agent of each actor."""
     data.qpos[:] = qpos
     place_surroundings(data, around)
     index = len(around)
-    for actor, (places, turns) in enumerate(paths):
+    for actor, (places, turns) in ((actor, path) for actor, agents in enumerate(paths) for path in agents):
         if actor and ghosts:
             data.mocap_pos[index], data.mocap_quat[index] = places[time], turns[time]
             index += 1

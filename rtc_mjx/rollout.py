@@ -29,7 +29,7 @@ def rollout(
 
     Args:
         scene: where.
-        actor: who, with the noise of all T steps.
+        actor: who, with the noise of all T steps; where the scene has several agents, all of them (`scenes.several.crew`).
         episode: s_0 and xi.
         gradient: what a backward pass follows from step to step: everything ('full'), the physics but not how the actor
             reacts to what it sees ('dynamics_only'), or nothing ('none'). The observations that the trajectory holds can be
@@ -45,7 +45,7 @@ def rollout(
         time, before, after, noise = inputs
         seen = scene.observe(episode, time, state)
         memory, action = actor.act(memory, seen if gradient == "full" else lax.stop_gradient(seen), noise)
-        reached = advance(damp(state, 0.0 if gradient == "none" else decay), action, before, after)
+        reached = advance(damp(state, 0.0 if gradient == "none" else decay), action.reshape(-1), before, after)
         return (memory, reached), (state, seen, action)
 
     # A backward pass keeps what steps hand on and the contact solutions; what the actor computed is computed again: it is cheaper

@@ -27,19 +27,21 @@ SEED, BATCH = "seed", "batch"  # axes of the mesh
 
 @dataclass(frozen=True)
 class Rows:
-    """How the rows of a minibatch are shared out among the devices that train a seed; used inside `over_seeds`.
+    """How the episodes of a minibatch, and their rows, are shared out among the devices that train a seed; used inside `over_seeds`.
 
     Attributes:
         parts: how many devices; one changes nothing.
+        agents: rows of an episode, one an agent; an episode is never divided.
     """
 
     parts: int = 1
+    agents: int = 1
 
     def mine(self, tree: Any, *sizes: int) -> Any:
-        """This device's rows.
+        """This device's episodes.
 
         Args:
-            tree: arrays whose leading axis holds the rows of several branches, one branch after another.
+            tree: arrays whose leading axis holds the episodes of several branches, one branch after another.
             sizes: of the branches; of each a share is taken.
         """
         if self.parts == 1:
@@ -50,17 +52,18 @@ class Rows:
         return jax.tree.map(lambda x: x[index], tree)
 
     def counting(self, chosen: jax.Array, *sizes: int) -> jax.Array:
-        """Those of the chosen rows of this device that do not only fill up its share."""
+        """Those of the chosen rows of this device that do not only fill up its share; `sizes` are the branches' numbers of episodes."""
         if self.parts == 1:
             return chosen
-        return chosen & jnp.asarray(np.concatenate([self._share(size) < size for size in sizes], axis=1))[lax.axis_index(BATCH)]
+        whole = np.concatenate([self._share(size) < size for size in sizes], axis=1)
+        return chosen & jnp.asarray(np.repeat(whole, self.agents, axis=1))[lax.axis_index(BATCH)]
 
     def count(self, size: int) -> int:
-        """How long a device's share of so many rows is."""
+        """How long a device's share of so many episodes is."""
         return math.ceil(size / self.parts)
 
     def _share(self, size: int) -> np.ndarray:
-        """The rows of all devices (devices, share); those from `size` on fill up."""
+        """The episodes of all devices (devices, share); those from `size` on fill up."""
         return np.arange(self.parts * self.count(size)).reshape(self.parts, self.count(size))
 
     def total(self, tree: Any) -> Any:

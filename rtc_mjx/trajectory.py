@@ -31,6 +31,9 @@ class Episode:
 class Trajectory:
     """One run of an actor in an episode.
 
+    Several agents of one episode have a joint trajectory, with an axis of agents after that of time; `Scene.apart` makes each agent's
+    own of it.
+
     Attributes:
         states: T+1 physics states (leading axis).
         observations: what the actor saw in each of them, in the scene's units.
@@ -38,8 +41,8 @@ class Trajectory:
     """
 
     states: PhysicsState
-    observations: Float[Array, "*batch steps_and_one features"]
-    actions: Float[Array, "*batch steps controls"]
+    observations: Float[Array, "*batch_steps_and_one features"]
+    actions: Float[Array, "*batch_steps controls"]
 
 
 @pytree
@@ -49,7 +52,7 @@ class Demonstration:
     Attributes:
         episode: s_0 and xi.
         trajectory: what the expert did.
-        truth: the expert's internal state, for analysis only: no policy, encoder or discriminator reads it.
+        truth: the expert's internal state (each expert's), for analysis only: no policy, encoder or discriminator reads it.
     """
 
     episode: Episode

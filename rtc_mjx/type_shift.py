@@ -32,7 +32,7 @@ from rtc_mjx.keys import stream
 from rtc_mjx.models import Networks
 from rtc_mjx.probe import information
 from rtc_mjx.runs import Run
-from rtc_mjx.scenes import Scene
+from rtc_mjx.scenes import Scene, merged
 from rtc_mjx.trained import Trained, trained
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
@@ -99,22 +99,24 @@ def shift(setup: Setup, watch: evaluate.Watch = iter) -> dict[str, dict[str, lis
 
 
 def inferred(setup: Setup) -> np.ndarray:
-    """A type drawn from the encoder for each test demonstration: (seeds, episodes, size)."""
+    """A type drawn from the encoder for each agent of each test demonstration: (seeds, rows, size)."""
+    rows = setup.learner.by_agent(setup.test)
 
     def one(networks: Networks, held: Demonstration, key: Array) -> Array:
         return SOURCES["encoder"](setup.learner.agent(networks), held, key).agent_type
 
-    keys = random.split(stream("type shift", 1), len(jax.tree.leaves(setup.test)[0]))
+    keys = random.split(stream("type shift", 1), len(jax.tree.leaves(rows)[0]))
     draw = jax.jit(lambda networks, test: lax.map(lambda n: jax.vmap(functools.partial(one, n))(test, keys), networks))
-    return np.asarray(draw(setup.networks, setup.test))
+    return np.asarray(draw(setup.networks, rows))
 
 
 def told_by_types(setup: Setup) -> dict[str, dict[str, Any]]:
     """Bits that types tell of xi, which they should not, and of the expert's mind, which they should; with the null of each."""
-    luck = np.asarray(jax.jit(jax.vmap(setup.config.scene.luck))(setup.test.episode))
+    luck = np.asarray(jax.jit(jax.vmap(setup.config.scene.luck))(setup.learner.by_agent(setup.test).episode))
     told = {"xi": luck}
-    if jax.tree.leaves(setup.truth):  # nobody knows what logged drivers had in mind
-        told["mind"] = np.stack([np.asarray(x, float) for x in jax.tree.leaves(setup.truth)], axis=1)
+    minds = jax.tree.leaves(merged(setup.config.scene, setup.truth))
+    if minds:  # nobody knows what logged drivers had in mind
+        told["mind"] = np.stack([np.asarray(x, float) for x in minds], axis=1)
     types = inferred(setup)
     out = {}
     for name, of in told.items():
@@ -132,17 +134,19 @@ def reencoding(setup: Setup) -> dict[str, list[float]]:
     """
 
     def one(networks: Networks, mine: Demonstration, elsewhere: Demonstration, key: Array) -> dict[str, Array]:
-        agent = setup.learner.agent(networks)
+        agent, scene = setup.learner.agent(networks), setup.config.scene
         draw, noise = random.split(key)
-        g = SOURCES["encoder"](agent, mine, draw).agent_type
-        prior = agent.prior(mine.trajectory.observations[0]).log_prob(g)
+        g, first = setup.learner.types("encoder", agent, mine, draw).agent_type, scene.apart(mine.trajectory).observations[..., 0, :]
+
+        def bits(track: Trajectory, g: Array, first: Array) -> Array:
+            return (agent.posterior(track).log_prob(g) - agent.prior(first).log_prob(g)) / jnp.log(2.0)
 
         def told(track: Trajectory) -> Array:
-            return (agent.posterior(track).log_prob(g) - prior) / jnp.log(2.0)
+            return scene.each(bits)(scene.apart(track), g, first)
 
         tracks = {"rollout": mine.episode, "rollout_elsewhere": elsewhere.episode}
         return {"demonstration": told(mine.trajectory)} | {
-            name: told(setup.learner.play(agent, episode, g, noise)) for name, episode in tracks.items()
+            name: told(setup.learner.play(agent, episode, g, scene.key_each(noise))) for name, episode in tracks.items()
         }
 
     test = setup.test
@@ -154,7 +158,7 @@ def reencoding(setup: Setup) -> dict[str, list[float]]:
         )
     )
     # a rollout that leaves what the encoder knows may be told from its type by thousands of bits: the median is not moved by it
-    return {name: [float(x) for x in np.median(values, axis=1)] for name, values in jax.device_get(run(setup.networks)).items()}
+    return {name: [float(np.median(of_seed)) for of_seed in values] for name, values in jax.device_get(run(setup.networks)).items()}
 
 
 def realism(setup: Setup, episodes: int, experts: int, watch: evaluate.Watch = iter) -> dict[str, Any]:
@@ -173,6 +177,9 @@ def realism(setup: Setup, episodes: int, experts: int, watch: evaluate.Watch = i
     theirs = jax.device_get(_described(scene, held, others))
     ours = evaluate.roller(setup.learner, experts, watch)(setup.networks, held, {}, stream("type shift", 3))["prior"]
     evaluate.check_finite(ours[evaluate.FINITE], "prior")
+    if scene.agents > 1:  # each agent by itself: of (episodes, experts, agents, ...) and (seeds, rollouts, episodes, agents, ...)
+        theirs = {name: merged(scene, x.swapaxes(1, 2)) for name, x in theirs.items()}
+        ours = {name: x.reshape(*x.shape[:2], -1, *x.shape[4:]) for name, x in ours.items() if x.ndim > 3}
     features = {name: compared(ours[name], theirs[name]) for name in scene.described_by}
     return {"episodes": episodes, "experts": experts, "features": features}
 

@@ -7,6 +7,7 @@ from rtc_mjx.scenes.intersection import Intersection
 from rtc_mjx.scenes.merge import Merge
 from rtc_mjx.scenes.recorded import Recorded
 from rtc_mjx.scenes.roundabout import Roundabout
+from rtc_mjx.scenes.several import crew, merged, parted
 
 SCENES: dict[str, type[Scene]] = {
     "double_goal": DoubleGoal,
@@ -29,5 +30,6 @@ def scene_type(name: str) -> type[Scene]:
 
 
 __all__ = [
-    "SCENES", "Actor", "DoubleGoal", "Intersection", "ItemSet", "Merge", "Recorded", "Roundabout", "Scene", "scene_type", "split_items",
+    "SCENES", "Actor", "DoubleGoal", "Intersection", "ItemSet", "Merge", "Recorded", "Roundabout", "Scene", "crew", "merged", "parted",
+    "scene_type", "split_items",
 ]  # fmt: skip

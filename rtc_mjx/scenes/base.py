@@ -1,7 +1,8 @@
 """What every scene offers, in the order in which an episode is lived: reset, observe, reward, expert, label, features, metrics.
 
 A scene is a frozen dataclass of settings; its methods are pure functions of one episode. The world (an MJCF file) holds the
-physics, the scene says what happens in it.
+physics, the scene says what happens in it. Where several agents live in one episode, what each of them has or does has a leading
+axis of agents; where there is one, that axis is not there (`rtc_mjx.scenes.several`).
 """
 
 import abc
@@ -17,18 +18,20 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rtc_mjx.physics import PhysicsState, World
+from rtc_mjx.pytree import pytree
 from rtc_mjx.trajectory import Demonstration, Episode, Trajectory
 
 Act = Callable[[Any, Array, Any], tuple[Any, Array]]  # (memory, observation, noise of one step) -> (memory, action)
 
 
-@dataclass(frozen=True)
+@pytree
 class Actor:
     """Someone who acts in a rollout: an expert, a policy under one type, a replay.
 
     Attributes:
         memory: what the actor carries from step to step, at the start; any pytree.
-        act: (memory, observation, noise of the step) -> (memory, action).
+        act: (memory, observation, noise of the step) -> (memory, action); a `jax.tree_util.Partial` of what tells this actor from
+            others of its kind (a type, a mind), where several of them may act in one episode.
         noise: the pre-drawn noise, leading axis T; a rollout is a deterministic function of it.
     """
 
@@ -105,14 +108,45 @@ class Scene(abc.ABC):
         """The physics of the scene."""
 
     @property
+    def agents(self) -> int:
+        """How many agents act in an episode."""
+        return 1
+
+    @property
+    def agent_bodies(self) -> tuple[str, ...]:
+        """The body of each agent; cameras may belong to that of the first, `agent_body`."""
+        return (self.agent_body,)
+
+    @property
+    def controls(self) -> int:
+        """How many controls an agent has."""
+        return len(self.world.control_ids) // self.agents
+
+    def each(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """A function of one agent as a function of all of an episode's: vmapped over their axis; itself where there is one agent."""
+        return jax.vmap(function) if self.agents > 1 else function
+
+    def key_each(self, key: jax.Array) -> jax.Array:
+        """A key for each agent; the key itself where there is one."""
+        return jax.random.split(key, self.agents) if self.agents > 1 else key
+
+    def views(self, held: Demonstration) -> Demonstration:
+        """A joint demonstration as each agent's own, as if it were alone and everybody else replayed."""
+        return held
+
+    def apart(self, track: Trajectory) -> Trajectory:
+        """A joint trajectory as each agent's own."""
+        return track
+
+    @property
     def control_range(self) -> Float[np.ndarray, "controls 2"]:
         """Lowest and highest value of each control."""
         return np.asarray(self.world.mj.actuator_ctrlrange[list(self.world.control_ids)])
 
     @property
     def control_unit(self) -> Float[np.ndarray, "controls"]:
-        """A typical size of each control: what a policy puts out is in these units."""
-        return np.ones(len(self.world.control_ids))
+        """A typical size of each control of an agent: what a policy puts out is in these units."""
+        return np.ones(self.controls)
 
     def notes(self, episodes: Episode) -> dict[str, int]:
         """What a reader of metrics on these episodes (leading axis) should know: what was left out or not counted, and how often."""
@@ -120,7 +154,7 @@ class Scene(abc.ABC):
 
     @abc.abstractmethod
     def luck(self, episode: Episode) -> Float[Array, "numbers"]:
-        """The episode's xi as a vector: what the episode has in store for the agent, seen from where it starts (analysis only)."""
+        """The xi of an agent's view of an episode, as a vector: what it has in store, seen from where the agent starts (analysis only)."""
 
     def flipped(self, episode: Episode) -> Episode | None:
         """The same episode with luck turned round (a red light green); None where there is nothing to turn.
@@ -159,11 +193,11 @@ class Scene(abc.ABC):
         """Draws s_0 and xi."""
 
     @abc.abstractmethod
-    def observe(self, episode: Episode, time: Array, state: PhysicsState) -> Float[Array, "features"]:
+    def observe(self, episode: Episode, time: Array, state: PhysicsState) -> Float[Array, "*agents features"]:
         """What an actor sees at control step `time` (0 to T)."""
 
     @abc.abstractmethod
-    def reward(self, episode: Episode, time: Array, state: PhysicsState) -> Float[Array, ""]:
+    def reward(self, episode: Episode, time: Array, state: PhysicsState) -> Float[Array, "*agents"]:
         """What being in this state at control step `time` is worth; no method learns from it."""
 
     @abc.abstractmethod
@@ -172,10 +206,10 @@ class Scene(abc.ABC):
 
     @abc.abstractmethod
     def label(self, demonstration: Demonstration) -> Array | None:
-        """Symphony's hand-made type of a demonstration as a one-hot vector; None where the scene has none."""
+        """Symphony's hand-made type of an agent's view of a demonstration, as a one-hot vector; None where the scene has none."""
 
     def discrepancy(self, demonstration: Demonstration, trajectory: Trajectory) -> Float[Array, ""]:
-        """L_rec between a demonstration and a rollout, where the scene `reconstructs_rollouts`."""
+        """L_rec between one agent's demonstration and rollout, where the scene `reconstructs_rollouts`."""
         raise NotImplementedError(f"scene {self.name} reconstructs actions")
 
     @abc.abstractmethod
@@ -187,6 +221,6 @@ class Scene(abc.ABC):
         """The scene's metrics of one population of trajectories against the expert's.
 
         Args:
-            features: of the population, with leading axes (samples, episodes).
-            expert: of the expert, with a leading axis of episodes.
+            features: of the population, with leading axes (samples, episodes), and agents where there are several.
+            expert: of the expert, with a leading axis of episodes, and agents.
         """

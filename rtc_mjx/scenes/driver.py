@@ -12,13 +12,15 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 from jax import random
+from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
-from rtc_mjx.physics.car import WHEELBASE
+from rtc_mjx.physics.car import CAR, WHEELBASE
 from rtc_mjx.scenes.base import Actor, split_items
-from rtc_mjx.scenes.driving import AHEAD, CAR, OWN
+from rtc_mjx.scenes.driving import OWN
+from rtc_mjx.scenes.routes import Routes
+from rtc_mjx.scenes.sight import AHEAD
 from rtc_mjx.scenes.traffic import COMFORT, GRIP, follow_the_leader
-from rtc_mjx.trajectory import Episode
 
 if TYPE_CHECKING:
     from rtc_mjx.scenes.driving import Driving
@@ -35,10 +37,10 @@ LATEST = 4  # control steps by which a driver may see a signal change late
 ROUTES = (0.9, 1.1, 0.9)  # how often each is taken, where there are three
 
 
-def expert_driver(key: jax.Array, scene: "Driving", episode: Episode, speeds: tuple[float, float]) -> tuple[Actor, Any]:
-    """A driver for an episode, and its internal truth."""
+def expert_driver(key: jax.Array, scene: "Driving", routes: Routes, speeds: tuple[float, float]) -> tuple[Actor, Any]:
+    """A driver who has these routes to choose from, and its internal truth."""
     keys = iter(random.split(key, 10))
-    valid = episode.context.routes.valid
+    valid = routes.valid
     weight = jnp.where(valid, jnp.resize(jnp.array(ROUTES), valid.shape), 0.0)
     inattentive, ignores = random.bernoulli(next(keys), 0.15), random.bernoulli(next(keys), 0.12)
     truth = {
@@ -52,7 +54,7 @@ def expert_driver(key: jax.Array, scene: "Driving", episode: Episode, speeds: tu
     }
     tremor = random.normal(next(keys), (scene.steps, 2)) * jnp.array([0.12, 0.006])
 
-    def act(memory: Array, observation: Array, noise: Array) -> tuple[Array, Array]:
+    def act(truth: dict[str, Array], memory: Array, observation: Array, noise: Array) -> tuple[Array, Array]:
         own, (routes, users) = split_items(scene.sets, OWN, observation)
         route = routes[truth["route"]]
         seen = jnp.where(jnp.all(memory < 0), route[5:8], memory)  # at t = 0 nothing was seen before
@@ -60,7 +62,7 @@ def expert_driver(key: jax.Array, scene: "Driving", episode: Episode, speeds: tu
         pull = pedals(own, route, memory[truth["late"]], users, truth)
         return memory, jnp.stack([pull, steering(own, route, truth["aside"])]) + noise
 
-    return Actor(jnp.full((LATEST, 3), -1.0), act, tremor), truth
+    return Actor(jnp.full((LATEST, 3), -1.0), Partial(act, truth), tremor), truth
 
 
 def way_ahead(route: Float[Array, "numbers"]) -> tuple[Float[Array, "points"], Float[Array, "points 2"]]:

@@ -1,14 +1,16 @@
-"""Driving in a logged scene: one car of the MJX world, everybody else replayed (Igl et al., section V-B).
+"""Driving in a logged scene: one car of the MJX world, or several, everybody else replayed (Igl et al., section V-B).
 
     logged scene -> routes ahead, the nearest road users -> episode -> observation in the agent's own frame
                                                                     -> corners, contacts, road edges -> features -> metrics
 
-Everything here reads the logged scene only: subclasses say where scenes come from, and who demonstrates in them.
+Everything here reads the logged scene only: subclasses say where scenes come from, and who demonstrates in them. How several cars
+share an episode is told in `rtc_mjx.scenes.several`.
 """
 
 import abc
 import dataclasses
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -16,28 +18,25 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from rtc_mjx import metrics
-from rtc_mjx.geometry import boxes_overlap, capsule_gap, closest_approach, corners, off_road, pose_at, project, rotate, wrapped
-from rtc_mjx.logs import AMBER, GREEN, PEDESTRIAN, RATE, RED, LoggedScene, RoadGraph
+from rtc_mjx.errors import UsageError
+from rtc_mjx.geometry import boxes_overlap, capsule_gap, corners, off_road, project, rotate
+from rtc_mjx.logs import GREEN, RATE, RED, LoggedScene, RoadGraph
 from rtc_mjx.logs.picture import draw_road
 from rtc_mjx.physics import PhysicsState, Surroundings, World, load, rest_state, specialised_step, substates
-from rtc_mjx.physics.car import CONTROL_UNIT
+from rtc_mjx.physics.car import CAR, CONTROL_UNIT
 from rtc_mjx.pytree import pytree
 from rtc_mjx.scenes import scenery
 from rtc_mjx.scenes.base import ItemSet, Scene
-from rtc_mjx.scenes.routes import BEHIND, SPACING, RouteOptions, Routes, find_routes
+from rtc_mjx.scenes.routes import SPACING, RouteOptions, Routes, find_routes
+from rtc_mjx.scenes.several import cars_apart, cars_together, the_others
+from rtc_mjx.scenes.sight import FAR, OFF_ROUTE, ROUTE, USER, Others, around_each, see_routes, see_users
 from rtc_mjx.trajectory import Demonstration, Episode, Trajectory
 
-CAR = (4.6, 1.9)  # m, length and width of the agent's car (assets/car.xml)
 CONTROL_EVERY = 3  # logged times a control step: 10 Hz to 3.3 Hz
 OWN = 4  # numbers of an observation about the car itself
-AHEAD = (2.0, 5.0, 8.0, 12.0, 16.0, 20.0, 25.0, 30.0, 40.0, 50.0)  # m along a route, where it is looked at
-FAR = 60.0  # m, beyond which nothing is told apart
-NEAR, SOON = 15.0, 5.0  # m and s, up to which it is told how close somebody is or will be
-OFF_ROUTE = 5.0  # m to the side, beyond which a route is no longer one's own
 SAME_ROUTE = 0.05  # m, mean difference in distance from the path below which routes fit alike
 PAST = 1.0  # m past a stop line, from where it counts as crossed
 AWAY = 1e3  # m, where road users wait that are not there
@@ -49,6 +48,8 @@ SAMPLES = 16  # K of minADE
 class Road:
     """What an episode's observations, features and pictures read beside the poses of road users.
 
+    What is an agent's own (routes, ghosts, whether it starts off the road) has a leading axis of agents where there are several.
+
     Attributes:
         graph: the road graph.
         signals: of each lane at each of the T+1 times.
@@ -57,10 +58,12 @@ class Road:
         yaw_rate: of the road users, rad/s.
         kind: of each, as in `logs`; 0 for none.
         present: when each is there.
-        ghosts: road users that overlap the agent at t = 0: they do not count as its collisions.
+        ghosts: those that overlap the agent at t = 0, road users and then other agents: they do not count as its collisions.
         starts_off_road: whether the log itself has the agent off the road at t = 0: its off-road time does not count.
         dropped: road users within reach for which there was no body.
     """
+
+    own: ClassVar[tuple[str, ...]] = ("routes", "ghosts", "starts_off_road")
 
     graph: RoadGraph
     signals: Int[Array, "*batch times lanes"]
@@ -69,7 +72,7 @@ class Road:
     yaw_rate: Float[Array, "*batch times users"]
     kind: Int[Array, "*batch users"]
     present: Bool[Array, "*batch times users"]
-    ghosts: Bool[Array, "*batch users"]
+    ghosts: Bool[Array, "*batch others"]
     starts_off_road: Bool[Array, "*batch"]
     dropped: Int[Array, "*batch"]
 
@@ -81,10 +84,12 @@ class Driving(Scene):
     Attributes:
         steps: T, the number of control steps of 0.3 s in an episode.
         road_users: bodies for replayed road users; the nearest are kept.
+        controlled: cars that are driven, each by an agent with a type of its own; the road users are replayed.
     """
 
     main_metrics: ClassVar[tuple[str, ...]] = ("collision_rate", "offroad_time", "min_ade", "progress_jsd")
     agent_body: ClassVar[str] = "car0/chassis"
+    room: ClassVar[int] = 1  # cars that can be driven in an episode
     substeps: ClassVar[int] = 6
     route_options: ClassVar[RouteOptions] = RouteOptions()
     samples: ClassVar[int] = SAMPLES
@@ -95,11 +100,32 @@ class Driving(Scene):
     side_by_side: ClassVar[bool] = True
     steps: int = 30
     road_users: int = 8
+    controlled: int = 1
+
+    def __post_init__(self) -> None:
+        """Refuses more cars than there is room for, and none at all.
+
+        Raises:
+            UsageError: one of these.
+        """
+        if not 1 <= self.controlled <= self.room:
+            room = f"from 1 to {self.room} cars can be driven" if self.room > 1 else "one car is driven, everybody else is replayed"
+            raise UsageError(f"--scene.controlled {self.controlled}: in scene {self.name} {room}")
 
     @functools.cached_property
     def world(self) -> World:
-        """One car, and bodies for road users."""
-        return car_among(self.road_users)
+        """The cars that are driven, and bodies for road users."""
+        return cars_among(self.controlled, self.road_users)
+
+    @property
+    def agents(self) -> int:
+        """The cars that are driven."""
+        return self.controlled
+
+    @property
+    def agent_bodies(self) -> tuple[str, ...]:
+        """The chassis of each car."""
+        return tuple(f"car{car}/chassis" for car in range(self.controlled))
 
     @property
     def logged_times(self) -> int:
@@ -119,7 +145,26 @@ class Driving(Scene):
     @property
     def sets(self) -> tuple[ItemSet, ...]:
         """After the car itself: the routes, then the road users."""
-        return (ItemSet("routes", self.route_options.count, 11 + 2 * len(AHEAD)), ItemSet("road_users", self.road_users, 14))
+        around = self.road_users + self.controlled - 1
+        return (ItemSet("routes", self.route_options.count, ROUTE), ItemSet("road_users", around, USER))
+
+    def views(self, held: Demonstration) -> Demonstration:
+        """Each car's own demonstration: what is not its own is the same for all."""
+        if self.controlled == 1:
+            return held
+        road = held.episode.context
+        shared = {f.name: getattr(road, f.name) for f in dataclasses.fields(road) if f.name not in road.own}
+        copied = jax.tree.map(lambda x: jnp.broadcast_to(x, (self.controlled, *x.shape)), (held.episode.surroundings, shared))
+        start = cars_apart(held.episode.start, self.controlled)
+        episode = Episode(start, copied[0], dataclasses.replace(road, **copied[1]))
+        return Demonstration(episode, self.apart(held.trajectory), held.truth)
+
+    def apart(self, track: Trajectory) -> Trajectory:
+        """Each car's own trajectory."""
+        if self.controlled == 1:
+            return track
+        seen, done = (jnp.moveaxis(x, -2, 0) for x in (track.observations, track.actions))
+        return Trajectory(cars_apart(track.states, self.controlled), seen, done)
 
     def notes(self, episodes: Episode) -> dict[str, int]:
         """Agents and road users that metrics or bodies leave out."""
@@ -166,54 +211,81 @@ class Driving(Scene):
         return self.episode(self.log(key))
 
     def episode(self, log: LoggedScene) -> Episode:
-        """The agent where and as fast as it was logged at t = 0, the nearest road users as they were logged."""
+        """The agents where and as fast as they were logged at t = 0, the nearest road users as they were logged."""
         log, times = with_room_for(log, self.road_users), CONTROL_EVERY * jnp.arange(self.steps + 1)
-        start, velocity = log.pose[log.controlled, 0], log.velocity[log.controlled, 0]
         kept, dropped = nearest_users(log, self.road_users)
         pose, present = (
             log.pose[kept][:, times].swapaxes(0, 1),
-            log.valid[kept][:, times].swapaxes(0, 1) & (log.kind[kept] > 0) & (kept != log.controlled),
+            log.valid[kept][:, times].swapaxes(0, 1) & (log.kind[kept] > 0) & ~jnp.isin(kept, log.controlled),
         )
         away = jnp.stack([AWAY + 20.0 * jnp.arange(self.road_users), jnp.full(self.road_users, AWAY), jnp.zeros(self.road_users)], axis=1)
         heading = jnp.unwrap(pose[..., 2], axis=0)
         turned = jnp.diff(heading, axis=0)
         placed = jnp.where(present[..., None], pose.at[..., 2].set(heading), away)
         size = jnp.broadcast_to(log.size[kept], (self.steps + 1, self.road_users, 2))
-        routes = find_routes(log, start, self.route_options)
-        overlap = capsule_gap(start, jnp.array(CAR), placed[0], size[0]) < 0
+        start, velocity = log.pose[log.controlled, 0], log.velocity[log.controlled, 0]
+        routes = self.each(lambda pose: _at_times(find_routes(log, pose, self.route_options), times))(start)
         road = Road(
             graph=log.road,
             signals=log.signals[times],
-            routes=dataclasses.replace(routes, signals=routes.signals[times]),
+            routes=routes,
             velocity=log.velocity[kept][:, times].swapaxes(0, 1),
             yaw_rate=jnp.where(present, jnp.concatenate([turned[:1], turned]) * RATE / CONTROL_EVERY, 0.0),
             kind=log.kind[kept],
             present=present,
-            ghosts=overlap & present[0],
-            starts_off_road=jnp.any(past_edges(start, log.road) > 0),
+            ghosts=self.with_others(start, placed[0], size[0], lambda *near: capsule_gap(*near) < 0),
+            starts_off_road=self.each(lambda pose: jnp.any(past_edges(pose, log.road) > 0))(start),
             dropped=dropped,
         )
-        rest = rest_state(self.world)
-        qpos, qvel = rest.qpos.at[:3].set(start), rest.qvel.at[:2].set(velocity)
-        return Episode(PhysicsState(qpos, qvel, rest.warmstart), Surroundings(placed, size), road)
+        return Episode(self.started(start, velocity), Surroundings(placed, size), road)
 
-    def observe(self, episode: Episode, time: Array, state: PhysicsState) -> Float[Array, "features"]:
-        """The car's own motion, then the routes ahead of it, then the road users, in its own frame; see `see_routes`, `see_users`."""
-        pose, road = state.qpos[:3], episode.context
-        own = rotate(state.qvel[:2], -pose[2])
-        routes = see_routes(road.routes, road.routes.signals[time], pose)
+    def started(self, start: Float[Array, "*agents 3"], velocity: Float[Array, "*agents 2"]) -> PhysicsState:
+        """The cars at these poses and velocities in m/s, not turning."""
+        cars = cars_apart(rest_state(self.world), self.controlled)
+        qpos, qvel = cars.qpos.at[..., :3].set(start), cars.qvel.at[..., :2].set(velocity)
+        return cars_together(PhysicsState(qpos, qvel, cars.warmstart), self.controlled)
+
+    def observe(self, episode: Episode, time: Array, state: PhysicsState) -> Float[Array, "*agents features"]:
+        """Of each car its own motion, then the routes ahead of it, then those around it, in its own frame; see `see_routes`, `see_users`.
+
+        Those around it are the road users, and after them the other cars that are driven.
+        """
+        road = episode.context
         around = jax.tree.map(lambda x: x[time], episode.surroundings)
-        users = see_users(around, road.velocity[time], road.yaw_rate[time], road.present[time], road.kind, pose, state.qvel[:2])
-        return jnp.concatenate([own, state.qvel[2:3], state.qpos[3:4], routes.reshape(-1), users.reshape(-1)])
+        replayed = Others(around.pose, around.size, road.velocity[time], road.yaw_rate[time], road.kind, road.present[time])
 
-    def reward(self, episode: Episode, time: Array, state: PhysicsState) -> Float[Array, ""]:
+        def see(routes: Routes, qpos: Array, qvel: Array, others: Others) -> Array:
+            pose = qpos[:3]
+            own = rotate(qvel[:2], -pose[2])
+            ahead = see_routes(routes, routes.signals[time], pose)
+            return jnp.concatenate([own, qvel[2:3], qpos[3:4], ahead.reshape(-1), see_users(others, pose, qvel[:2]).reshape(-1)])
+
+        cars = cars_apart(state, self.controlled)
+        return self.each(see)(road.routes, cars.qpos, cars.qvel, around_each(replayed, cars, self.controlled))
+
+    def reward(self, episode: Episode, time: Array, state: PhysicsState) -> Float[Array, "*agents"]:
         """Metres a second along the best of its routes, nothing while off the road or in contact."""
-        pose, around = state.qpos[:3], jax.tree.map(lambda x: x[time], episode.surroundings)
-        touching = jnp.any(capsule_gap(pose, jnp.array(CAR), around.pose, around.size) < 0)
-        past = jnp.any(past_edges(pose, episode.context.graph) > 0)
-        heading = jax.vmap(lambda path: project(path, SPACING, pose[:2])[2])(episode.context.routes.paths)
-        along = jnp.cos(heading) * state.qvel[0] + jnp.sin(heading) * state.qvel[1]
-        return jnp.where(touching | past, 0.0, jnp.max(jnp.where(episode.context.routes.valid, along, -jnp.inf)))
+        around = jax.tree.map(lambda x: x[time], episode.surroundings)
+        cars = cars_apart(state, self.controlled)
+        touching = jnp.any(self.with_others(cars.qpos[..., :3], around.pose, around.size, lambda *near: capsule_gap(*near) < 0), axis=-1)
+
+        def one(routes: Routes, qpos: Array, qvel: Array, touching: Array) -> Array:
+            past = jnp.any(past_edges(qpos[:3], episode.context.graph) > 0)
+            heading = jax.vmap(lambda path: project(path, SPACING, qpos[:2])[2])(routes.paths)
+            along = jnp.cos(heading) * qvel[0] + jnp.sin(heading) * qvel[1]
+            return jnp.where(touching | past, 0.0, jnp.max(jnp.where(routes.valid, along, -jnp.inf)))
+
+        return self.each(one)(episode.context.routes, cars.qpos, cars.qvel, touching)
+
+    def with_others(
+        self, pose: Float[Array, "*agents 3"], users: Float[Array, "users 3"], sizes: Float[Array, "users 2"], compare: Callable[..., Any]
+    ) -> Any:
+        """A comparison (pose, size, others' poses, their sizes) of each car with the road users and the other cars."""
+        if self.controlled == 1:
+            return compare(pose, jnp.array(CAR), users, sizes)
+        index = the_others(self.controlled)
+        long = jnp.concatenate([sizes, jnp.tile(jnp.array(CAR), (self.controlled - 1, 1))])
+        return jax.vmap(lambda mine, cars: compare(mine, jnp.array(CAR), jnp.concatenate([users, cars]), long))(pose, pose[index])
 
     def label(self, demonstration: Demonstration) -> Float[Array, "labels"]:
         """The lane sequence that was driven (Symphony's type): the route nearest to the path over its second half.
@@ -237,37 +309,26 @@ class Driving(Scene):
         return jnp.mean(jnp.where(off < 1, 0.5 * off**2, off - 0.5))
 
     def features(self, demonstration: Demonstration, trajectory: Trajectory) -> dict[str, Array]:
-        """Of one trajectory: collisions, time off the road, distance from the expert, progress, curvature where lanes branch, reds run."""
+        """Of each car: collisions, time off the road, distance from the expert, progress, curvature where lanes branch, reds run."""
         episode = demonstration.episode
-        road, qpos = episode.context, trajectory.states.qpos
-        touch, overlap = self.encounters(episode, trajectory)
-        past = jax.vmap(lambda q: jnp.any(past_edges(q[:3], road.graph) > 0))(qpos)
-        crossed = crossings(road.routes, qpos)
-        bend, branching = jax.vmap(lambda q: _bend(road.routes, q[:2]))(qpos)
-        return {
-            "collision": jnp.any(touch & ~road.ghosts),
-            "overlap": jnp.any(overlap & ~road.ghosts),
-            "offroad": jnp.where(road.starts_off_road, 0.0, jnp.mean(past)),
-            "ade": jnp.mean(jnp.sqrt(jnp.sum((qpos - demonstration.trajectory.states.qpos)[:, :2] ** 2, axis=1))),
-            "progress": jnp.sqrt(jnp.sum((qpos[-1] - qpos[0])[:2] ** 2)),
-            "curvature": bend,
-            "branching": branching,
-            "ran_red": ran_red(road.routes, crossed),
-            "decided": jnp.any(crossed),
-        }
+        expert = self.views(Demonstration(episode, demonstration.trajectory, ()))
+        return self.each(_features)(expert, self.apart(trajectory), *self.encounters(episode, trajectory))
 
-    def encounters(self, episode: Episode, trajectory: Trajectory) -> tuple[Bool[Array, "users"], Bool[Array, "users"]]:
-        """Whether the car touched each road user at any physics step: by contact of the collision capsules, and by overlap of the boxes."""
+    def encounters(self, episode: Episode, trajectory: Trajectory) -> tuple[Bool[Array, "*agents others"], Bool[Array, "*agents others"]]:
+        """Whether each car touched each of the others at any physics step: by contact of the collision capsules, and by overlap of boxes.
+
+        The others are the road users, and after them the other cars that are driven.
+        """
         run = substates(self.world, self.substeps, specialised_step(self.world))
 
         def one(state: PhysicsState, action: Array, before: Surroundings, after: Surroundings) -> tuple[Array, Array]:
-            states, around = run(state, action, before, after)
+            states, around = run(state, action.reshape(-1), before, after)
 
-            def check(q: Array, around: Surroundings) -> tuple[Array, Array]:
-                mine = (q[:3], jnp.array(CAR), around.pose, around.size)
-                return capsule_gap(*mine) < 0, boxes_overlap(*mine)
+            def check(state: PhysicsState, around: Surroundings) -> tuple[Array, Array]:
+                pose = cars_apart(state, self.controlled).qpos[..., :3]
+                return self.with_others(pose, around.pose, around.size, lambda *near: (capsule_gap(*near) < 0, boxes_overlap(*near)))
 
-            touch, overlap = jax.vmap(check)(states.qpos, around)
+            touch, overlap = jax.vmap(check)(states, around)
             return jnp.any(touch, axis=0), jnp.any(overlap, axis=0)
 
         before, after = (jax.tree.map(lambda x, part=part: x[part], episode.surroundings) for part in (slice(None, -1), slice(1, None)))
@@ -276,13 +337,17 @@ class Driving(Scene):
         return jnp.any(touch, axis=0), jnp.any(overlap, axis=0)
 
     def metrics(self, features: dict[str, np.ndarray], expert: dict[str, np.ndarray]) -> dict[str, float]:
-        """Over (samples, episodes): rates, minADE in m over the samples, divergences in bits; bins span the range of the expert's."""
+        """Over (samples, episodes) and agents: rates, minADE in m, divergences in bits; bins span the range of the expert's.
+
+        A minimum is over the samples, for each agent by itself; all else counts each agent of each sample alike.
+        """
         here, there = (_on_branches(f) for f in (features, expert))
+        sampled = features["ade"].ndim > expert["ade"].ndim
         return {
             "collision_rate": float(np.mean(features["collision"])),
             "overlap_rate": float(np.mean(features["overlap"])),
             "offroad_time": float(np.mean(features["offroad"])),
-            "min_ade": float(np.mean(np.min(np.atleast_2d(features["ade"]), axis=0))),
+            "min_ade": float(np.mean(np.min(features["ade"], axis=0) if sampled else features["ade"])),
             "curvature_jsd": metrics.jsd(here, there, bins=BINS, limits=span(there)),
             "progress_jsd": metrics.jsd(features["progress"], expert["progress"], bins=BINS, limits=span(expert["progress"])),
             "ran_red_rate": float(np.mean(features["ran_red"])),
@@ -290,9 +355,33 @@ class Driving(Scene):
 
 
 @functools.lru_cache(maxsize=8)
-def car_among(road_users: int) -> World:
-    """The driving world with one car; one object for all scenes, so that its specialised step is made once."""
-    return load("driving", road_users=road_users)
+def cars_among(cars: int, road_users: int) -> World:
+    """The driving world with so many cars; one object for all scenes, so that its specialised step is made once."""
+    return load("driving", cars=cars, road_users=road_users)
+
+
+def _features(demonstration: Demonstration, trajectory: Trajectory, touch: Array, overlap: Array) -> dict[str, Array]:
+    """Of one car, which touched or overlapped some of the others."""
+    road, qpos = demonstration.episode.context, trajectory.states.qpos
+    past = jax.vmap(lambda q: jnp.any(past_edges(q[:3], road.graph) > 0))(qpos)
+    crossed = crossings(road.routes, qpos)
+    bend, branching = jax.vmap(lambda q: _bend(road.routes, q[:2]))(qpos)
+    return {
+        "collision": jnp.any(touch & ~road.ghosts),
+        "overlap": jnp.any(overlap & ~road.ghosts),
+        "offroad": jnp.where(road.starts_off_road, 0.0, jnp.mean(past)),
+        "ade": jnp.mean(jnp.sqrt(jnp.sum((qpos - demonstration.trajectory.states.qpos)[:, :2] ** 2, axis=1))),
+        "progress": jnp.sqrt(jnp.sum((qpos[-1] - qpos[0])[:2] ** 2)),
+        "curvature": bend,
+        "branching": branching,
+        "ran_red": ran_red(road.routes, crossed),
+        "decided": jnp.any(crossed),
+    }
+
+
+def _at_times(routes: Routes, times: Int[Array, "times"]) -> Routes:
+    """Routes with the signals of some of the logged times."""
+    return dataclasses.replace(routes, signals=routes.signals[times])
 
 
 def span(values: np.ndarray) -> tuple[float, float]:
@@ -306,8 +395,8 @@ def _on_branches(features: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def with_room_for(log: LoggedScene, count: int) -> LoggedScene:
-    """The same scene with entries enough for as many road users beside the agent; those added are of no kind."""
-    more = max(0, count + 1 - log.kind.shape[0])
+    """The same scene with entries enough for as many road users beside those that are driven; those added are of no kind."""
+    more = max(0, count + log.controlled.size - log.kind.shape[0])
 
     def longer(x: Array) -> Array:
         return jnp.pad(x, [(0, more), *[(0, 0)] * (x.ndim - 1)])
@@ -318,11 +407,11 @@ def with_room_for(log: LoggedScene, count: int) -> LoggedScene:
 
 
 def nearest_users(log: LoggedScene, count: int) -> tuple[Int[Array, "count"], Int[Array, ""]]:
-    """The road users that come nearest to where the agent starts, at any time, the agent last; and how many others there are."""
-    start = log.pose[log.controlled, 0, :2]
-    distance = jnp.where(log.valid, jnp.sqrt(jnp.sum((log.pose[..., :2] - start) ** 2, axis=-1)), jnp.inf)
-    others = jnp.min(distance, axis=1)
-    others = jnp.where((jnp.arange(len(others)) == log.controlled) | (log.kind == 0), jnp.inf, others)
+    """The road users that come nearest to where an agent starts, at any time, the agents last; and how many others there are."""
+    starts = log.pose[jnp.atleast_1d(log.controlled), 0, :2]
+    away = jnp.min(jnp.sqrt(jnp.sum((log.pose[..., :2] - starts[:, None, None]) ** 2, axis=-1)), axis=0)
+    others = jnp.min(jnp.where(log.valid, away, jnp.inf), axis=1)
+    others = jnp.where(jnp.isin(jnp.arange(len(others)), log.controlled) | (log.kind == 0), jnp.inf, others)
     order = jnp.argsort(others)[:count]
     return order, jnp.maximum(0, jnp.sum(jnp.isfinite(others)) - count)
 
@@ -330,61 +419,6 @@ def nearest_users(log: LoggedScene, count: int) -> tuple[Int[Array, "count"], In
 def past_edges(pose: Float[Array, "3"], road: RoadGraph) -> Float[Array, "4"]:
     """How far each corner of the car is past the nearest road edge, m; negative on the road."""
     return jax.vmap(lambda corner: off_road(corner, road.edges, road.edge_valid))(corners(pose, jnp.array(CAR)))
-
-
-def see_routes(routes: Routes, signals: Int[Array, "routes"], pose: Float[Array, "3"]) -> Float[Array, "routes 31"]:
-    """Each route from a pose.
-
-    Per route: 1 (there), m to its left, cosine and sine of the heading error, m to the stop line, red, amber, green, m to the
-    give-way line, and to whom it gives way (0, 1, 2), curvature 10 m ahead, then x and y of the points AHEAD in the car's frame. A
-    route too far to the side is not there, unless it is the nearest.
-    """
-
-    def see(path: Array, signal: Array, stop: Array, give_way: Array, whom: Array) -> tuple[Array, Array]:
-        station, aside, heading = project(path, SPACING, pose[:2])
-        points = jax.vmap(lambda ahead: pose_at(path, SPACING, station + ahead))(jnp.array(AHEAD))
-        seen = rotate(points[:, :2] - pose[:2], jnp.broadcast_to(-pose[2], len(AHEAD)))
-        off = pose[2] - heading
-        bend = wrapped(points[4, 2] - points[1, 2]) / (AHEAD[4] - AHEAD[1])
-        to_stop, to_give = jnp.clip(jnp.stack([stop, give_way]) - station, -BEHIND, FAR)
-        told = jnp.stack([
-            aside, jnp.cos(off), jnp.sin(off), to_stop, 1.0 * (signal == RED), 1.0 * (signal == AMBER), 1.0 * (signal == GREEN),
-            to_give, 1.0 * whom, bend,
-        ])  # fmt: skip
-        return jnp.concatenate([told, seen.reshape(-1)]), jnp.abs(aside)
-
-    told, aside = jax.vmap(see)(routes.paths, signals, routes.stop, routes.give_way, routes.gives_way_to)
-    aside = lax.stop_gradient(jnp.where(routes.valid, aside, jnp.inf))
-    there = routes.valid & ((aside < OFF_ROUTE) | (jnp.arange(len(aside)) == jnp.argmin(aside)))
-    told = jnp.where(there[:, None], told, 0.0)
-    return jnp.concatenate([there[:, None].astype(told.dtype), told], axis=1)
-
-
-def see_users(
-    around: Surroundings,
-    velocity: Float[Array, "users 2"],
-    yaw_rate: Float[Array, "users"],
-    present: Bool[Array, "users"],
-    kind: Int[Array, "users"],
-    pose: Float[Array, "3"],
-    own_velocity: Float[Array, "2"],
-) -> Float[Array, "users 14"]:
-    """Each road user from a pose.
-
-    Per user: 1 (there), x, y, cosine and sine of its heading, velocity, length, width, whether it walks, yaw rate, then what a driver
-    sees at a glance: m between both bodies, and, if both went straight on, in how many s they would be closest and how far apart then.
-    """
-    turned = jnp.broadcast_to(-pose[2], len(present))
-    place = rotate(around.pose[:, :2] - pose[:2], turned)
-    heading = around.pose[:, 2] - pose[2]
-    there = present & (lax.stop_gradient(jnp.max(jnp.abs(place), axis=1)) < FAR)
-    gap = jnp.minimum(capsule_gap(pose, jnp.array(CAR), around.pose, around.size), NEAR)
-    soon, closest = closest_approach(place, rotate(velocity - own_velocity, turned), SOON)
-    told = jnp.concatenate([
-        place, jnp.cos(heading)[:, None], jnp.sin(heading)[:, None], rotate(velocity, turned), around.size,
-        1.0 * (kind == PEDESTRIAN)[:, None], yaw_rate[:, None], jnp.stack([gap, soon, jnp.minimum(closest, NEAR)], axis=1),
-    ], axis=1)  # fmt: skip
-    return jnp.concatenate([there[:, None].astype(told.dtype), jnp.where(there[:, None], told, 0.0)], axis=1)
 
 
 def _bend(routes: Routes, point: Float[Array, "2"]) -> tuple[Array, Array]:

@@ -1,7 +1,8 @@
 """A signalised four-way intersection, generated: one lane each way, signals, traffic, people on the crosswalks.
 
 External, xi: when the light changes, who comes from where, whether a car in front brakes hard, who crosses. Internal to the expert:
-its route, speed, headway, how large a gap it takes and how late it looks (`rtc_mjx.scenes.driver`). The agent comes from the south.
+its route, speed, headway, how large a gap it takes and how late it looks (`rtc_mjx.scenes.driver`). The agent comes from the south; where
+more cars are driven, they come from the north, the east and the west.
 """
 
 import dataclasses
@@ -15,8 +16,8 @@ from jaxtyping import Array, Float, Int
 
 from rtc_mjx.geometry import resample, rotate
 from rtc_mjx.logs import AMBER, GREEN, NO_SIGNAL, PEDESTRIAN, RATE, RED, VEHICLE, LoggedScene, RoadGraph
-from rtc_mjx.scenes.driving import CAR
-from rtc_mjx.scenes.generated import Generated, Others, assemble, moving
+from rtc_mjx.physics.car import CAR
+from rtc_mjx.scenes.generated import Generated, Traffic, assemble, moving
 from rtc_mjx.scenes.roads import POINTS, arc, ring_edges, straight, thinned
 from rtc_mjx.scenes.traffic import Drivers, Walkers, drive, walk
 from rtc_mjx.trajectory import Episode
@@ -34,6 +35,7 @@ LEFT, STRAIGHT, RIGHT = 0, 1, 2
 PRESENT = (0.45, 0.25, 0.75, 0.6, 0.7, 0.7)  # of two in front of the agent, two oncoming, two crossing
 WALKING = (0.4, 0.4)
 BRAKES_HARD = 0.2  # of the cars in front of the agent
+LAST = (3, 4, 5)  # in the traffic: the last that comes from the north, the east, the west
 
 
 @dataclass(frozen=True)
@@ -43,9 +45,11 @@ class Intersection(Generated):
     Attributes:
         steps: T, the number of control steps of 0.3 s in an episode.
         road_users: bodies for replayed road users; the nearest are kept.
+        controlled: cars that are driven, each by an agent with a type of its own; the road users are replayed.
     """
 
     name: ClassVar[str] = "intersection"
+    room: ClassVar[int] = 1 + len(LAST)
     speeds: ClassVar[tuple[float, float]] = SPEED
 
     def flipped(self, episode: Episode) -> Episode:
@@ -69,7 +73,8 @@ class Intersection(Generated):
         ahead, across = cycle(lights, times)
         pose, speed = approach(own, width, corner, ahead[0])
         others = traffic(who, road, width, corner, ahead, across, pose, speed, times)
-        return assemble(road, lane_signals(ahead, across), pose, speed, others, times)
+        taken = jnp.array(LAST[: self.controlled - 1], int)
+        return assemble(road, lane_signals(ahead, across), pose, speed, others, taken, times)
 
 
 def mouth(width: Array, corner: Array) -> Array:
@@ -132,7 +137,7 @@ def approach(key: jax.Array, width: Array, corner: Array, signal: Array) -> tupl
 
 def traffic(
     key: jax.Array, road: RoadGraph, width: Array, corner: Array, ahead: Array, across: Array, pose: Array, speed: Array, times: int
-) -> Others:
+) -> Traffic:
     """Poses (users, times, 3), velocities, sizes and kinds of all but the agent."""
     keys = iter(random.split(key, 12))
     arms = jnp.array([SOUTH, SOUTH, NORTH, NORTH, EAST, WEST])

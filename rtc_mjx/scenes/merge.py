@@ -1,6 +1,7 @@
 """A ramp that joins a road, generated: the agent comes down the ramp, finds a gap, and later stays on the road or leaves it.
 
-External, xi: who drives on the road, how fast and how far apart. Internal to the expert: its speed, its gap, whether it leaves.
+External, xi: who drives on the road, how fast and how far apart. Internal to the expert: its speed, its gap, whether it leaves. One
+car is driven: no expert on the road would make way for another one that joins.
 """
 
 from dataclasses import dataclass
@@ -13,8 +14,8 @@ from jaxtyping import Array
 
 from rtc_mjx.geometry import resample
 from rtc_mjx.logs import NO_SIGNAL, VEHICLE, LoggedScene, RoadGraph
-from rtc_mjx.scenes.driving import CAR
-from rtc_mjx.scenes.generated import Generated, Others, assemble, moving
+from rtc_mjx.physics.car import CAR
+from rtc_mjx.scenes.generated import Generated, Traffic, assemble, moving
 from rtc_mjx.scenes.roads import POINTS, as_segments, beside, bezier, straight, thinned
 from rtc_mjx.scenes.routes import RouteOptions
 from rtc_mjx.scenes.traffic import Drivers, drive, nothing_to_stop_for
@@ -37,6 +38,7 @@ class Merge(Generated):
     Attributes:
         steps: T, the number of control steps of 0.3 s in an episode.
         road_users: bodies for replayed road users; the nearest are kept.
+        controlled: one; everybody else is replayed.
     """
 
     name: ClassVar[str] = "merge"
@@ -55,7 +57,7 @@ class Merge(Generated):
         end = road.lanes[RAMP_LANE, -1]
         pose = jnp.concatenate([end - back * jnp.stack([jnp.cos(angle), jnp.sin(angle)]), angle[None]])
         signals = jnp.full((times, road.lanes.shape[0]), NO_SIGNAL)
-        return assemble(road, signals, pose, speed, traffic(who, road, times), times)
+        return assemble(road, signals, pose, speed, traffic(who, road, times), jnp.zeros(0, int), times)
 
 
 def ramp(angle: Array) -> RoadGraph:
@@ -81,7 +83,7 @@ def ramp(angle: Array) -> RoadGraph:
     return RoadGraph(lanes, successors, jnp.array([0, 0, 2, 0, 0, 0]), edges, jnp.ones(len(edges), bool), jnp.zeros((1, 4, 2)))
 
 
-def traffic(key: jax.Array, road: RoadGraph, times: int) -> Others:
+def traffic(key: jax.Array, road: RoadGraph, times: int) -> Traffic:
     """Poses, velocities, sizes and kinds of a line of vehicles on the road."""
     keys = iter(random.split(key, 7))
     count = 6

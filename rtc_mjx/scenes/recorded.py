@@ -72,6 +72,7 @@ class Recorded(Driving):
     Attributes:
         steps: T, the number of control steps of 0.3 s in an episode.
         road_users: bodies for replayed road users; the nearest are kept.
+        controlled: one; everybody else is replayed.
         data: a file, a folder or a glob of recordings, of any kind that `python -m rtc_mjx.data` reads.
         control: whose scenes: every vehicle that moves, the self-driving car's, or those of tracks_to_predict.
         start: s from the start of a recording to that of its scenes.

@@ -1,5 +1,7 @@
 """A roundabout of four arms, generated: the agent comes from the south, gives way, and leaves by one of three exits.
 
+Where more cars are driven, they come from the east, the north and the west; some are in the ring already.
+
 External, xi: who circulates and how fast. Internal to the expert: the exit, its speed, the gap it takes.
 """
 
@@ -13,8 +15,8 @@ from jaxtyping import Array
 
 from rtc_mjx.geometry import resample, rotate
 from rtc_mjx.logs import NO_SIGNAL, VEHICLE, LoggedScene, RoadGraph
-from rtc_mjx.scenes.driving import CAR
-from rtc_mjx.scenes.generated import Generated, Others, assemble, moving
+from rtc_mjx.physics.car import CAR
+from rtc_mjx.scenes.generated import Generated, Traffic, assemble, moving
 from rtc_mjx.scenes.roads import arc, as_segments, beside, bezier, straight, thinned
 from rtc_mjx.scenes.routes import RouteOptions
 from rtc_mjx.scenes.traffic import Drivers, drive, nothing_to_stop_for
@@ -31,6 +33,7 @@ CIRCLING = (4.6, 5.6)  # m/s, what the others want: not faster than one who has 
 IN, ENTRY, SHORT, LONG, EXIT, OUT = range(6)  # lanes of an arm: in, onto the ring, to the next exit, past it to the next entry, off, out
 FROM = (3, 3, 3, 1, 2)  # arms that traffic comes from: nobody's way crosses another's
 PRESENT = (0.75, 0.65, 0.5, 0.6, 0.6)
+LAST = (3, 4, 2)  # in the traffic: the last that comes from the east, the north, the west
 
 
 @dataclass(frozen=True)
@@ -40,9 +43,11 @@ class Roundabout(Generated):
     Attributes:
         steps: T, the number of control steps of 0.3 s in an episode.
         road_users: bodies for replayed road users; the nearest are kept.
+        controlled: cars that are driven, each by an agent with a type of its own; the road users are replayed.
     """
 
     name: ClassVar[str] = "roundabout"
+    room: ClassVar[int] = 1 + len(LAST)
     speeds: ClassVar[tuple[float, float]] = SPEED
     settings: ClassVar[str] = "intersection"
     route_options: ClassVar[RouteOptions] = RouteOptions(lanes=9)
@@ -57,7 +62,8 @@ class Roundabout(Generated):
         speed = random.uniform(pace, minval=0.5) * jnp.minimum(8.0, jnp.sqrt(2 * 2.0 * back))
         pose = jnp.stack([jnp.array(WIDTH / 2), -radius - MOUTH - back - CAR[0] / 2, jnp.array(jnp.pi / 2)])
         signals = jnp.full((times, road.lanes.shape[0]), NO_SIGNAL)
-        return assemble(road, signals, pose, speed, traffic(who, road, times), times)
+        taken = jnp.array(LAST[: self.controlled - 1], int)
+        return assemble(road, signals, pose, speed, traffic(who, road, times), taken, times)
 
 
 def ring(radius: Array) -> RoadGraph:
@@ -102,7 +108,7 @@ def ring(radius: Array) -> RoadGraph:
     return RoadGraph(every, successors, gives_way, edges, jnp.ones(len(edges), bool), jnp.zeros((1, 4, 2)))
 
 
-def traffic(key: jax.Array, road: RoadGraph, times: int) -> Others:
+def traffic(key: jax.Array, road: RoadGraph, times: int) -> Traffic:
     """Poses, velocities, sizes and kinds of those who circulate: from the west past the agent's entry, and elsewhere."""
     keys = iter(random.split(key, 6))
     count, arms = len(FROM), jnp.array(FROM)
