@@ -70,4 +70,4 @@ def by_source(axes: Axes, held: Mapping[str, Mapping[str, Any]], metric: str) ->
     axes.set_xticks(range(len(held)), [name.replace("_", "\n") for name in held], fontsize=8)
     axes.set_title(metric.replace("_", " "), fontsize=10)
     labelled = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-    axes.legend(labelled.values(), labelled.keys(), fontsize=7, frameon=False)
+    axes.legend(labelled.values(), labelled.keys(), fontsize=7, framealpha=0.8, edgecolor="none")
