@@ -5,7 +5,6 @@ import io
 import json
 import logging
 import os
-import platform
 import tempfile
 from collections.abc import Iterable, Mapping
 from importlib import metadata
@@ -16,7 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-VERSIONS = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")  # packages that results depend on
+from rtc_mjx.provenance import NUMERIC
+
 DIGEST_BYTES = 32
 
 
@@ -33,20 +33,12 @@ def keep_compiled() -> Path:
     return kept
 
 
-def versions() -> dict[str, str]:
-    """Of Python and of the packages that results depend on, and a hash of this package's own code, by name."""
-    here = Path(__file__).parent
-    code = hashlib.sha256(b"".join(file.read_bytes() for file in sorted(here.rglob("*.py")))).hexdigest()[:12]
-    named = {name: metadata.version(name) for name in VERSIONS}
-    return {"Python": platform.python_version(), **named, "rtc_mjx code": code}
-
-
 def fingerprint(made_by: Mapping[str, Any], code: Iterable[Path]) -> str:
     """Hash of what determines a result: what it was made by, the code that made it, versions of packages, precision."""
     everything = {
         **made_by,
         "code": hashlib.sha256(b"".join(file.read_bytes() for file in code)).hexdigest(),
-        "versions": [metadata.version(name) for name in VERSIONS],
+        "versions": [metadata.version(name) for name in NUMERIC],
         "type": str(jnp.zeros(0).dtype),
     }
     return hashlib.sha256(json.dumps(everything, sort_keys=True).encode()).hexdigest()[:32]

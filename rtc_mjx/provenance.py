@@ -1,5 +1,7 @@
 """What a result was made by: versions of the packages, and the commit of the code."""
 
+import hashlib
+import platform
 import subprocess
 from importlib import metadata
 from pathlib import Path
@@ -7,13 +9,22 @@ from typing import Any
 
 from rtc_mjx import __version__
 
-PACKAGES = ("mujoco", "mujoco-mjx", "jax", "flax", "optax")
+PACKAGES = ("mujoco", "mujoco-mjx", "jax", "flax", "optax")  # that a result names
+NUMERIC = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")  # that numbers depend on, to the last bit
 
 
 def made_by() -> dict[str, Any]:
     """`versions` of the packages and `commit` of the checkout that this code runs from (None where there is none)."""
     versions = {"python_package": __version__, **{name: metadata.version(name) for name in PACKAGES}}
     return {"versions": versions, "commit": _commit()}
+
+
+def versions() -> dict[str, str]:
+    """Of Python and of the packages that numbers depend on, and a hash of this package's own code, by name."""
+    here = Path(__file__).parent
+    code = hashlib.sha256(b"".join(file.read_bytes() for file in sorted(here.rglob("*.py")))).hexdigest()[:12]
+    named = {name: metadata.version(name) for name in NUMERIC}
+    return {"Python": platform.python_version(), **named, "rtc_mjx code": code}
 
 
 def _commit() -> str | None:

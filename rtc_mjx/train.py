@@ -19,7 +19,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from rtc_mjx import cache, cli, dataset, evaluate, sharding
+from rtc_mjx import cache, cli, dataset, evaluate, provenance, sharding
 from rtc_mjx import config as settings
 from rtc_mjx.cluster import joined
 from rtc_mjx.config import Config
@@ -210,7 +210,7 @@ def agreed(config: Config) -> dict[str, Any]:
     """What must be the same in all processes that train together: settings, package versions, and this package's code."""
     options = {f"--{name.replace('_', '-')}": value for name, value in settings.flat(settings.to_dict(config)).items()}
     where = {"--run": str(config.folder), "--resume": config.resume}
-    return {**options, **where, **cache.versions()}
+    return {**options, **where, **provenance.versions()}
 
 
 if __name__ == "__main__":
