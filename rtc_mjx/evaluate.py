@@ -32,7 +32,7 @@ from rtc_mjx.keys import stream
 from rtc_mjx.learner import Learner
 from rtc_mjx.methods import Method
 from rtc_mjx.models import Networks
-from rtc_mjx.provenance import made_by
+from rtc_mjx.provenance import made_by, of_recordings
 from rtc_mjx.pytree import in_parts
 from rtc_mjx.runs import Run
 from rtc_mjx.scenes import Recorded, Scene
@@ -147,8 +147,10 @@ def evaluate(run: Run, episodes: int, watch: Watch = iter) -> dict[str, Any]:
     means = {source: _summaries(config, features[source], expert, table[source]) for source in table}
     scene = config.scene
     recorded = {"sim_agents": challenge(scene, learner, networks, episodes, stream("evaluation", 1))} if isinstance(scene, Recorded) else {}
+    recordings = {"recordings": of_recordings(lines)} if (lines := scene.recordings()) else {}
     return (
         recorded
+        | recordings
         | made_by()
         | {
             "scene": config.scene.name,

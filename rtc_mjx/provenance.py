@@ -1,8 +1,10 @@
 """What a result was made by: versions of the packages, and the commit of the code."""
 
+import collections
 import hashlib
 import platform
 import subprocess
+from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,12 @@ def versions() -> dict[str, str]:
     code = hashlib.sha256(b"".join(file.read_bytes() for file in sorted(here.rglob("*.py")))).hexdigest()[:12]
     named = {name: metadata.version(name) for name in NUMERIC}
     return {"Python": platform.python_version(), **named, "rtc_mjx code": code}
+
+
+def of_recordings(lines: Sequence[str]) -> dict[str, Any]:
+    """How many recorded scenes each part has (`Scene.recordings`, a line each), and a `digest` that tells them from all others."""
+    digest = hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
+    return {**collections.Counter(line.split()[0] for line in lines), "digest": digest}
 
 
 def _commit() -> str | None:

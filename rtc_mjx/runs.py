@@ -24,6 +24,7 @@ from rtc_mjx.errors import RunError, UsageError, quiet_destructors
 from rtc_mjx.files import write_whole
 
 KEPT = 3  # checkpoints
+RECORDINGS = "recordings.json"  # which the run learns from and is tested on, where its scene has any
 
 
 class Run:
@@ -50,6 +51,8 @@ class Run:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             settings.write(config, folder)
+            if recordings := config.scene.recordings():
+                write_whole(folder / RECORDINGS, json.dumps(recordings, indent=1) + "\n")
             for part in ("checkpoints", "media"):
                 (folder / part).mkdir()
         except OSError as error:
@@ -64,6 +67,23 @@ class Run:
             UsageError: it is not a run directory, or a damaged one.
         """
         return cls(folder, settings.read(folder))
+
+    def check_recordings(self) -> None:
+        """That the recordings are still those the run began with: its inputs are scaled by them, and its parts are of them.
+
+        Raises:
+            UsageError: they are not; or it is not known which they were.
+        """
+        there, file = self.config.scene.recordings(), self.folder / RECORDINGS
+        if not there:
+            return
+        try:
+            before = {str(line) for line in json.loads(file.read_text())}
+        except (OSError, ValueError, TypeError) as error:
+            raise UsageError(f"{file} cannot be read: it is not known which recordings the run began with ({error})") from error
+        if changed := sorted(before ^ set(there)):
+            at_first = f"the {len(before)} it began with ({RECORDINGS})"
+            raise UsageError(f"{self.folder}: its recordings are not {at_first}; {len(changed)} went or came, first '{changed[0]}'")
 
     @property
     def metrics_file(self) -> Path:

@@ -23,7 +23,7 @@ from rtc_mjx import cache, cli, dataset, evaluate, provenance, sharding
 from rtc_mjx import config as settings
 from rtc_mjx.cluster import joined
 from rtc_mjx.config import Config
-from rtc_mjx.errors import DivergedError
+from rtc_mjx.errors import DivergedError, UsageError
 from rtc_mjx.keys import stream
 from rtc_mjx.learner import Learner, TrainState, compiled_chunk, start_all, start_shapes
 from rtc_mjx.progress import Reporter
@@ -40,22 +40,39 @@ def train(config: Config, team: Team = ALONE) -> Run:
         team: the processes that train together, all of which call this.
 
     Raises:
-        UsageError: the run directory cannot be used.
+        UsageError: the run directory cannot be used, or the recordings.
         DivergedError: what is learned is not finite any more.
         RunError: a checkpoint could not be written.
         KeyboardInterrupt: interrupted; a checkpoint was saved first.
     """
     config = settings.check(config)
     config.scene.ready()
+    compare_recordings(config, team)
     run = opened(config) if team.leads else Follower(config.folder, config)
     with run.lock():
         learn(run, config, team)
     return run
 
 
+def compare_recordings(config: Config, team: Team) -> None:
+    """That all processes have the same recordings, each from its own machine's files.
+
+    Raises:
+        UsageError: they do not.
+    """
+    told = team.exchange(provenance.of_recordings(config.scene.recordings()))
+    for process, theirs in enumerate(told):
+        if theirs != told[0]:
+            raise UsageError(f"{team.name(process)} has other recordings ({theirs}) than {team.name(0)} ({told[0]})")
+
+
 def opened(config: Config) -> Run:
     """The run directory: an existing one to go on in, or a new one."""
-    return Run.open(config.folder) if config.resume else Run.create(config)
+    if not config.resume:
+        return Run.create(config)
+    run = Run.open(config.folder)
+    run.check_recordings()
+    return run
 
 
 def learn(run: Run, config: Config, team: Team) -> None:

@@ -30,9 +30,10 @@ def trained(run: Run) -> Trained:
     """Loads the run's last whole checkpoint.
 
     Raises:
-        RunError: it has none.
+        UsageError: it has none; or the recordings it learned from are not there any more.
     """
     config = run.config
+    run.check_recordings()
     learner = config.learner(dataset.statistics(config.scene, dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN)))
     update, state, _ = run.restore(start_shapes(learner, config.all_seeds))
     return Trained(config, learner, state.networks, update)

@@ -14,6 +14,7 @@ from made import made, recordings
 
 from rtc_mjx import config, dataset, evaluate, inverse_dynamics, train
 from rtc_mjx.challenge import at_log_rate
+from rtc_mjx.config import Config
 from rtc_mjx.errors import UsageError
 from rtc_mjx.inverse_dynamics import FitOptions, fit, start_of
 from rtc_mjx.learner import compiled_chunk, start_all
@@ -21,8 +22,10 @@ from rtc_mjx.logs.convert import Options
 from rtc_mjx.logs.store import scenes
 from rtc_mjx.methods import METHODS
 from rtc_mjx.physics import rest_surroundings, simulate, specialised_step
+from rtc_mjx.runs import RECORDINGS
 from rtc_mjx.scenes.recorded import FOLLOWED, HEADED, Recorded, fitted, part_of
 from rtc_mjx.scenes.recorded import driven as logged
+from rtc_mjx.team import ALONE, Team
 
 STEP, SUBSTEPS = 0.3, 6
 KINDS = ("womd_scenario", "womd_tf_example", "gpudrive_json", "scenarionet_waymo", "scenarionet_nuscenes")
@@ -108,6 +111,17 @@ def test_recordings_that_are_not_there_leave_no_run_behind(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_processes_with_other_recordings_are_named():
+    class Pair(Team):
+        def exchange(self, value, last=False):
+            return [value, value | {"digest": "another"}]
+
+    held = Config(scene=made("womd"))
+    train.compare_recordings(held, ALONE)
+    with pytest.raises(UsageError, match=r"^process 1 \(there\) has other recordings .*another.* than process 0 \(here\)"):
+        train.compare_recordings(held, Pair(hosts=("here", "there")))
+
+
 def test_recorded_scenes_say_what_they_cannot_do(tmp_path):
     with pytest.raises(UsageError, match=r"--scene\.data.*where the recordings are"):
         Recorded().pool("train")
@@ -150,6 +164,7 @@ def test_every_method_learns_from_recordings(method, tmp_path):
     assert any(jax.tree.leaves(moved))
 
 
+@pytest.mark.usefixtures("quick_to_compile")
 def test_a_training_on_recordings_is_tested_and_evaluated(tmp_path):
     run = train.train(settings("symphony", tmp_path / "run"))
     line = run.metrics()[-1]
@@ -160,6 +175,17 @@ def test_a_training_on_recordings_is_tested_and_evaluated(tmp_path):
     (ours,), replay = result["sim_agents"]["prior"], result["sim_agents"]["log_replay"]
     assert replay["average_displacement_error"] == 0 < ours["average_displacement_error"]
     assert 0 < ours["realism_meta_metric"] < replay["realism_meta_metric"] <= 1
+
+    began_with = json.loads((run.folder / RECORDINGS).read_text())
+    told = result["recordings"]
+    assert told["train"] + told["test"] == len(began_with) and told["train"] == len(run.config.scene.pool("train").names)
+    (run.folder / RECORDINGS).write_text(json.dumps([*began_with[1:], "test another/1 0"]))
+    for use in (evaluate.main, lambda argv: train.main([*argv, "--resume"])):
+        with pytest.raises(UsageError, match="2 went or came"):
+            use(["--run", str(run.folder)])
+    (run.folder / RECORDINGS).unlink()
+    with pytest.raises(UsageError, match="not known which recordings"):
+        evaluate.evaluate(run, 4)
 
 
 def test_poses_at_the_rate_of_the_log_pass_through_those_of_the_control_steps():

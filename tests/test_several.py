@@ -167,6 +167,7 @@ def settings(folder, **changes):
     return dataclasses.replace(base, **changes)
 
 
+@pytest.mark.usefixtures("quick_to_compile")
 def test_a_training_of_two_cars_goes_on_to_the_same_numbers_and_is_tested_and_filmed(tmp_path):
     held = settings(tmp_path / "run")
     run, scene = Run.create(held), held.scene

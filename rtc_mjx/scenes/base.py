@@ -188,6 +188,10 @@ class Scene(abc.ABC):
         """Gets what a training needs from outside, so that what is wrong with it is said before anything is written."""
         return
 
+    def recordings(self) -> list[str]:
+        """Of recorded scenes a line for each: its part, its name, a digest of what was logged. Scenes that are generated have none."""
+        return []
+
     @abc.abstractmethod
     def reset(self, key: jax.Array) -> Episode:
         """Draws s_0 and xi."""

@@ -64,6 +64,12 @@ class Pool:
     names: tuple[str, ...]
     left_out: dict[str, float]
 
+    def named(self) -> list[str]:
+        """Of each scene its name and a digest of its log."""
+        leaves = jax.tree.leaves(self.logs)
+        digests = (hashlib.sha256(b"".join(np.asarray(x[i]).tobytes() for x in leaves)) for i in range(len(self.names)))
+        return [f"{name} {digest.hexdigest()[:16]}" for name, digest in zip(self.names, digests, strict=True)]
+
 
 @dataclass(frozen=True)
 class Recorded(Driving):
@@ -126,6 +132,10 @@ class Recorded(Driving):
         """
         for part in get_args(Part):
             self.pool(part)
+
+    def recordings(self) -> list[str]:
+        """Of each scene its part, its name and a digest of what was logged; those left out are not among them."""
+        return sorted(f"{part} {held}" for part in get_args(Part) for held in self.pool(part).named())
 
     def pool(self, part: Part) -> Pool:
         """The scenes of one part.
