@@ -1,7 +1,7 @@
 """Tables and figures of runs side by side: learning curves (mean and standard deviation over seeds) and the last evaluation.
 
-`python -m rtc_mjx.report RUN... --out DIR` writes curves.png, table.md and results in one JSON file a method: evaluation.json with the
-settings.
+`python -m rtc_mjx.report RUN... --out DIR` writes table.md, curves.png, overview.png, and results in one JSON file a method:
+evaluation.json with the settings.
 """
 
 import argparse
@@ -106,6 +106,38 @@ def curves(runs: Sequence[Run], file: Path) -> None:
     pyplot.close(canvas)
 
 
+def overview(runs: Mapping[str, Run], file: Path) -> None:
+    """Each method as an arrow, from its encoder's types of the same episode to those it draws at test time; methods without, as a point.
+
+    Upwards and downwards: the scene's first main metric. To the right: how badly the agents cover what experts do. Dots are seeds.
+    """
+    from matplotlib.figure import Figure
+
+    scene = next(iter(runs.values())).config.scene
+    across, up = scene.coverage, scene.main_metrics[0]
+    canvas = Figure(figsize=(6.4, 4.2), layout="constrained")
+    axes = canvas.subplots()
+    results = {name: evaluation(run) for name, run in runs.items()}
+    for index, (name, result) in enumerate(results.items()):
+        x, y = (np.array(result["metrics"][metric]["per_seed"]) for metric in (across, up))
+        axes.plot(x, y, ".", color=f"C{index}", markersize=4, alpha=0.5)
+        axes.plot(x.mean(), y.mean(), "o", color=f"C{index}", markersize=7, label=name)
+        if paired := result["types"].get("paired"):
+            tail = (paired[across]["mean"], paired[up]["mean"])
+            axes.annotate("", (x.mean(), y.mean()), tail, arrowprops={"arrowstyle": "->", "color": f"C{index}", "shrinkA": 3, "shrinkB": 4})
+            axes.plot(*tail, "o", color=f"C{index}", markersize=6, markerfacecolor="white")
+    expert = next(iter(results.values()))["reference"]["expert"]
+    axes.plot(expert[across], expert[up], "*", color="k", markersize=11, label="expert")
+    axes.plot([], [], "o", color="0.4", markerfacecolor="white", markersize=6, label="types of the same episode")
+    axes.set(xlabel=across.replace("_", " "), ylabel=up.replace("_", " "))
+    if across.startswith("jsd"):
+        axes.set_xscale("symlog", linthresh=1e-3)
+        axes.set_xlim(left=-2e-4)
+    axes.grid(alpha=0.25)
+    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    canvas.savefig(file, dpi=150)
+
+
 def record(run: Run) -> dict[str, Any]:
     """The evaluation with all that is needed to make it again."""
     return {**evaluation(run), "config": settings.to_dict(run.config)}
@@ -132,6 +164,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     text = table(dict(zip(methods, runs, strict=True)))
     (options.out / "table.md").write_text(text)
     curves(runs, options.out / "curves.png")
+    overview(dict(zip(methods, runs, strict=True)), options.out / "overview.png")
     for held in records:
         (options.out / f"{held['method']}.json").write_text(json.dumps(held, indent=1) + "\n")
     cli.console().print(Markdown(text))

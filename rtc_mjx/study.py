@@ -31,7 +31,7 @@ COMMAND = "python -m rtc_mjx.study"
 VARIED = "rtc_c"  # the method whose parts are varied
 VARIATIONS: Mapping[str, tuple[Any, ...]] = {  # option -> values beside the committed one
     "encoder-share": (0.125, 0.25, 0.5, 0.75),
-    "losses.adversarial": (0.3, 1.0, 10.0),
+    "losses.adversarial": (1.0, 3.0, 20.0),
     "losses.type-kl": (0.00003, 0.003, 0.03),
     "model.type-size": (1, 2, 4, 16),
     "losses.kl-direction": ("prior_posterior",),
@@ -135,6 +135,7 @@ def write(scene: str, runs: Mapping[str, Run], out: Path) -> str:
     parts = dict.fromkeys(TABLES, "")
     if methods:
         report.curves(list(methods.values()), out / "curves.png")
+        report.overview(methods, out / "overview.png")
         parts |= {"table": report.table(methods), "comparisons": claims.comparisons(methods), "claims": claims.claims(scene, methods)}
     if varied:
         parts["ablations"] = report.table({name: run for name, run in runs.items() if name == VARIED or name in varied})

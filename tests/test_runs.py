@@ -288,6 +288,7 @@ def test_report_draws_curves_and_writes_a_table(whole, evaluated, tmp_path):
     text = (tmp_path / "out" / "table.md").read_text()
     assert "rtc_c" in text and "shuffled" in text and "expert vs expert" in text
     assert (tmp_path / "out" / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "out" / "overview.png").read_bytes().startswith(b"\x89PNG")
     held = json.loads((tmp_path / "out" / "rtc_c.json").read_text())
     assert held["metrics"] == evaluated["metrics"] and held["config"]["method"] == "rtc_c" and "jax" in held["versions"]
 

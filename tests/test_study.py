@@ -126,6 +126,7 @@ def test_a_study_that_was_stopped_ends_like_one_that_was_not(tmp_path, monkeypat
         assert whole["metrics"] == stopped["metrics"] and whole["types"] == stopped["types"]
     assert (tmp_path / "whole/double_goal/table.md").read_text() == (tmp_path / "stopped/double_goal/table.md").read_text()
     assert (tmp_path / "whole/double_goal/curves.png").is_file()
+    assert (tmp_path / "whole/double_goal/overview.png").is_file()
     monkeypatch.setattr(train, "train", lambda *_: pytest.fail("what is finished was trained again"))
     monkeypatch.setattr(evaluate, "main", lambda argv: pytest.fail("what is finished was evaluated again"))
     begin("whole", "bc,mgail")

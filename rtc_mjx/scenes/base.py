@@ -76,7 +76,8 @@ class Scene(abc.ABC):
     name: ClassVar[str]
     settings: ClassVar[str] = ""  # the scene whose configs/<name>.toml it shares, if it has none of its own
     substeps: ClassVar[int] = 1
-    main_metrics: ClassVar[tuple[str, ...]] = ()
+    main_metrics: ClassVar[tuple[str, ...]] = ()  # the first is what an overview of methods shows
+    coverage: ClassVar[str] = ""  # the metric that says how badly the agents cover what experts do
     agent_body: ClassVar[str] = "agent"
     samples: ClassVar[int] = 1  # rollouts of each test episode, every one with a type of its own
     mark_size: ClassVar[float] = 0.018  # m, radius of the marks that trails are made of in videos

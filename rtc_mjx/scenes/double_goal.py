@@ -49,6 +49,7 @@ class DoubleGoal(Scene):
 
     name: ClassVar[str] = "double_goal"
     main_metrics: ClassVar[tuple[str, ...]] = ("return", "jsd_goal")
+    coverage: ClassVar[str] = "jsd_goal"
     described_by: ClassVar[tuple[str, ...]] = ("return", "upper", "left", "decided")
     steps: int = 60
     lower_probability: float = 0.75

@@ -88,6 +88,7 @@ class Driving(Scene):
     """
 
     main_metrics: ClassVar[tuple[str, ...]] = ("collision_rate", "offroad_time", "min_ade", "progress_jsd")
+    coverage: ClassVar[str] = "min_ade"
     agent_body: ClassVar[str] = "car0/chassis"
     room: ClassVar[int] = 1  # cars that can be driven in an episode
     substeps: ClassVar[int] = 6
