@@ -156,7 +156,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--methods", metavar="A,B", help="methods, separated by commas (default: all that run on the scene)")
     parser.add_argument("--seeds", type=int, default=20, metavar="N", help="seeds of each entry, trained in one program (default: 20)")
     parser.add_argument("--ablations", action="store_true", help=f"also vary the parts of {VARIED}: {', '.join(VARIATIONS)}")
-    parser.add_argument("--results", type=Path, required=True, metavar="DIR", help="tables and figures go to DIR/<scene>; made if absent")
+    parser.add_argument("--results", type=Path, required=True, metavar="DIR", help="tables and figures go to DIR/<name>; made if absent")
+    parser.add_argument("--name", metavar="NAME", help="of the study, where a scene has several (default: the scene's)")
     parser.add_argument("--runs", type=Path, metavar="DIR", help="where the runs are kept (default: runs/study)")
     options, rest = parser.parse_known_args(argv)
     scene_type(options.scene)
@@ -164,7 +165,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     if options.ablations and VARIED not in chosen:
         chosen.append(VARIED)  # what variations are compared with
     cache.keep_compiled()
-    folder, out = (options.runs or Path("runs/study")) / options.scene, options.results / options.scene
+    name = options.name or options.scene
+    if Path(name).name != name:
+        raise UsageError(f"--name {name}: a name is needed, not a path")
+    folder, out = (options.runs or Path("runs/study")) / name, options.results / name
     wanted = entries(options.scene, chosen, options.ablations, ["--seeds", str(options.seeds), *rest])
     first = config.from_command_line(["--scene", options.scene, "--method", chosen[0], *wanted[0].options], COMMAND)
     told = {**train.agreed(first), "--methods": ",".join(chosen), "--ablations": options.ablations, "--runs": str(folder)}
