@@ -35,4 +35,6 @@ again=()
 [[ -f $run/config.json ]] && again=(--resume)
 
 # A process that fails ends the others: they would end by themselves within --timeout.
-srun --kill-on-bad-exit=1 python -m rtc_mjx.train --distributed --timeout 300 "$@" "${again[@]}"
+# The CPUs of a task are said again: srun of Slurm 22.05 to 23.02 does not inherit them.
+srun --kill-on-bad-exit=1 --cpus-per-task="${SLURM_CPUS_PER_TASK:-1}" \
+    python -m rtc_mjx.train --distributed --timeout 300 "$@" ${again[@]+"${again[@]}"}

@@ -68,12 +68,14 @@ def place(options: Hardware) -> Place:
     Raises:
         UsageError: neither says so, or what they say is impossible.
     """
-    found: Any = (options.coordinator or os.environ.get("JAX_COORDINATOR_ADDRESS"), options.process_count, options.process_id, None)
+    local_devices = [int(x) for x in os.environ.get("JAX_LOCAL_DEVICE_IDS", "").split(",") if x.strip().isdigit()] or None
+    address = options.coordinator or os.environ.get("JAX_COORDINATOR_ADDRESS")
+    found: Any = (address, options.process_count, options.process_id, local_devices)
     detect: Any = ClusterEnv.auto_detect_unset_distributed_params
     try:
         if None in found[:3] or "KUBERNETES_SERVICE_HOST" not in os.environ:  # there it asks the cluster, if not in vain
             found = detect(*found, None, options.timeout)
-    except (RuntimeError, ValueError, KeyError, OSError) as error:
+    except Exception as error:  # each kind of cluster is asked by a library of its own, with errors of its own
         raise UsageError(f"--distributed: the job that this process belongs to cannot be read: {' '.join(str(error).split())}") from error
     address, count, process, local = found
     wanted = {"--coordinator HOST:PORT": address, "--process-count": count, "--process-id": process}

@@ -26,7 +26,7 @@ from rich.table import Table
 from rtc_mjx import cache, cli, dataset, metrics
 from rtc_mjx.challenge import challenge
 from rtc_mjx.config import Config
-from rtc_mjx.errors import RunError, UsageError
+from rtc_mjx.errors import DivergedError, UsageError
 from rtc_mjx.files import write_whole
 from rtc_mjx.keys import stream
 from rtc_mjx.learner import Learner
@@ -118,7 +118,7 @@ def score(config: Config, features: dict[str, Features], expert: Features) -> di
     """Metrics per type source, a list over seeds.
 
     Raises:
-        RunError: a rollout is not finite; a mean over the others would hide it.
+        DivergedError: a rollout is not finite; a mean over the others would hide it.
     """
     out: dict[str, dict[str, list[float]]] = {}
     for source, arrays in features.items():
@@ -129,9 +129,9 @@ def score(config: Config, features: dict[str, Features], expert: Features) -> di
 
 
 def check_finite(finite: np.ndarray, source: str) -> None:
-    """Raises RunError unless all rollouts under types of a source are finite."""
+    """Raises DivergedError unless all rollouts under types of a source are finite."""
     if not np.all(finite):
-        raise RunError(f"{int(np.sum(~finite))} of {finite.size} test rollouts under {source} types are not finite")
+        raise DivergedError(f"{int(np.sum(~finite))} of {finite.size} test rollouts under {source} types are not finite")
 
 
 def evaluate(run: Run, episodes: int, watch: Watch = iter) -> dict[str, Any]:

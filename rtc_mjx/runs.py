@@ -78,12 +78,13 @@ class Run:
         if not there:
             return
         try:
-            before = {str(line) for line in json.loads(file.read_text())}
+            before = [str(line) for line in json.loads(file.read_text())]
         except (OSError, ValueError, TypeError) as error:
             raise UsageError(f"{file} cannot be read: it is not known which recordings the run began with ({error})") from error
-        if changed := sorted(before ^ set(there)):
-            at_first = f"the {len(before)} it began with ({RECORDINGS})"
-            raise UsageError(f"{self.folder}: its recordings are not {at_first}; {len(changed)} went or came, first '{changed[0]}'")
+        if before != there:
+            changed = sorted(set(before) ^ set(there))
+            told = f"{len(changed)} went or came, first '{changed[0]}'" if changed else "they come in another order"
+            raise UsageError(f"{self.folder}: its recordings are not the {len(before)} it began with ({RECORDINGS}); {told}")
 
     @property
     def metrics_file(self) -> Path:

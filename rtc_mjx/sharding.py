@@ -135,6 +135,19 @@ class Grid:
 
         return call
 
+    def connect(self) -> None:
+        """Makes all devices speak once, in every group in which they will.
+
+        Called where the processes come together: a group forms within half a minute (gloo) or not at all, and later they may be farther
+        apart than that, as when one finds in its cache what the others compile.
+        """
+        if self.mesh is None:
+            return
+        everybody = P((SEED, BATCH))
+        spread = _placed(self.mesh, np.ones(self.mesh.size), everybody)
+        add = jax.shard_map(lambda x: lax.psum(x, BATCH), mesh=self.mesh, in_specs=everybody, out_specs=P(SEED), check_vma=False)
+        self.gathered((spread, jax.jit(add)(spread)))
+
     def by_seed(self, tree: Any) -> Any:
         """Arrays with a leading axis of seeds, each seed where it is trained."""
         return tree if self.mesh is None else _placed(self.mesh, tree, P(SEED))

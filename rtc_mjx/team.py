@@ -41,7 +41,7 @@ class Place:
     @property
     def address(self) -> str:
         """Of the coordinator."""
-        return f"{self.host}:{self.port}"
+        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
 
 
 class Link:
@@ -182,7 +182,8 @@ class Team:
     def _end(self, reason: str, status: int) -> NoReturn:
         """Ends this process from any thread: the main one may be waiting for numbers that never come."""
         with self._ending:
-            sys.stderr.write(reason + (GO_ON if status == 1 else "") + "\n")
+            with contextlib.suppress(OSError, ValueError):  # nobody may be reading any more: it ends all the same
+                sys.stderr.write(reason + (GO_ON if status == 1 else "") + "\n")
             self.stop_all(reason, status)
             leave(status)
 
@@ -309,7 +310,8 @@ def _call(here: Place, hello: Mapping[str, Any], left: float, patience: float) -
 def leave(status: int) -> NoReturn:
     """Ends the process at once, without farewells to processes that may be gone."""
     for stream in (sys.stdout, sys.stderr):
-        stream.flush()
+        with contextlib.suppress(OSError, ValueError):  # a full disk, a closed terminal
+            stream.flush()
     os._exit(status)
 
 

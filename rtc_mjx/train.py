@@ -26,6 +26,7 @@ from rtc_mjx.config import Config
 from rtc_mjx.errors import DivergedError, UsageError
 from rtc_mjx.keys import stream
 from rtc_mjx.learner import Learner, TrainState, compiled_chunk, start_all, start_shapes
+from rtc_mjx.methods import METHODS
 from rtc_mjx.progress import Reporter
 from rtc_mjx.runs import Follower, Run
 from rtc_mjx.sharding import Grid
@@ -48,9 +49,10 @@ def train(config: Config, team: Team = ALONE) -> Run:
     config = settings.check(config)
     config.scene.ready()
     compare_recordings(config, team)
+    grid = devices(config, team)
     run = opened(config) if team.leads else Follower(config.folder, config)
     with run.lock():
-        learn(run, config, team)
+        learn(run, config, grid, team)
     return run
 
 
@@ -75,12 +77,12 @@ def opened(config: Config) -> Run:
     return run
 
 
-def learn(run: Run, config: Config, team: Team) -> None:
+def learn(run: Run, config: Config, grid: Grid, team: Team) -> None:
     """The training loop."""
     expert = dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN)
     learner = config.learner(dataset.statistics(config.scene, expert))
-    grid = devices(config, learner)
     state, update, before = begin_together(run, learner, config, team)
+    grid.connect()
     state, data = grid.by_seed(state), grid.everywhere(dataset.without_truth(expert))
     test, chunks = Tests(config, learner, grid), functools.cache(lambda length: compiled_chunk(learner, length, grid))
     started = time.perf_counter() - before
@@ -104,15 +106,20 @@ def learn(run: Run, config: Config, team: Team) -> None:
                 raise KeyboardInterrupt
 
 
-def devices(config: Config, learner: Learner) -> Grid:
+def devices(config: Config, team: Team) -> Grid:
     """Where the training runs: on all devices of all processes, or on those of this machine that the work divides among.
 
     Raises:
-        UsageError: the work does not divide among as many devices as there must be.
+        UsageError: the work does not divide among as many devices as there must be, or processes have unequal numbers of them.
     """
+    local = team.exchange(jax.local_device_count())
+    for process, count in enumerate(local):
+        if count != local[0]:
+            raise UsageError(f"{team.name(process)} has {count} devices, {team.name(0)} {local[0]}: all processes need as many")
     there = jax.devices()
     wanted = len(there) if config.hardware.distributed else config.hardware.devices
-    found = sharding.grid(there, config.seeds, [learner.size(b) for b in learner.method.branches], wanted)
+    rows = [branch.rows(config.batch, config.encoder_share) for branch in METHODS[config.method].branches]
+    found = sharding.grid(there, config.seeds, [held.stop - held.start for held in rows], wanted)
     used = found.mesh.size if found.mesh else 1
     if used < (wanted or len(there)):
         sys.stderr.write(f"{used} of {len(there)} devices are used: seeds and minibatch do not divide among more\n")
@@ -226,7 +233,8 @@ def main(argv: Sequence[str] | None = None) -> None:
 def agreed(config: Config) -> dict[str, Any]:
     """What must be the same in all processes that train together: settings, package versions, and this package's code."""
     options = {f"--{name.replace('_', '-')}": value for name, value in settings.flat(settings.to_dict(config)).items()}
-    where = {"--run": str(config.folder), "--resume": config.resume}
+    where = {"--run": str(config.folder), "--resume": config.resume, "--timeout": config.hardware.timeout}
+    where |= {"JAX_ENABLE_X64": jax.config.read("jax_enable_x64")}
     return {**options, **where, **provenance.versions()}
 
 

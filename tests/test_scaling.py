@@ -186,6 +186,35 @@ def test_a_process_that_falls_silent_ends_the_others(monkeypatch, capsys):
     close([first, silent])
 
 
+class Unread:
+    """What a process writes to where nobody reads any more: a full disk, a closed terminal."""
+
+    def write(self, text):
+        raise OSError(28, "No space left on device")
+
+    flush = write
+
+
+def test_a_process_ends_though_it_cannot_say_why(monkeypatch):
+    port, ends = free_port(), queue.SimpleQueue()
+    monkeypatch.setattr("rtc_mjx.team.leave", ends.put)
+    first, gone = together(meeting(port, 0, 2), meeting(port, 1, 2))
+    monkeypatch.setattr(sys, "stderr", Unread())
+    first.watch()
+    close([gone])
+    assert ends.get(timeout=10) == 1
+    close([first])
+
+
+def test_processes_with_unequal_numbers_of_devices_are_named():
+    class Pair(Team):
+        def exchange(self, value, last=False):
+            return [value, value + 1]
+
+    with pytest.raises(UsageError, match=r"^process 1 \(there\) has 2 devices, process 0 \(here\) 1"):
+        train.devices(small(None), Pair(hosts=("here", "there")))
+
+
 def test_two_processes_of_one_number_are_refused():
     port = free_port()
     ends = together(meeting(port, 0, 3), meeting(port, 1, 3), meeting(port, 1, 3))
@@ -256,6 +285,10 @@ def test_slurm_says_where_a_process_stands(monkeypatch):
     here = cluster.place(Hardware(distributed=True))
     assert (here.host, here.process, here.count) == ("node07", 2, 3) and here.port > 1024
     assert cluster.place(Hardware(distributed=True, coordinator="other:1234")).address == "other:1234"
+    assert cluster.place(Hardware(distributed=True, coordinator="[::1]:1234")).address == "[::1]:1234"
+    assert list(here.local_devices) == [0]
+    monkeypatch.setenv("JAX_LOCAL_DEVICE_IDS", "2,3")
+    assert cluster.place(Hardware(distributed=True)).local_devices == [2, 3]
 
 
 @pytest.mark.parametrize(
@@ -350,15 +383,16 @@ def test_more_devices_than_there_is_work_for_are_refused_or_left_out(tmp_path):
     """One episode of the minibatch goes to one branch, three to the other: a fourth device would have nothing to do."""
     code = """
         import sys
-        from rtc_mjx import cli, config, dataset, train
+        from rtc_mjx import cli, config, train
+        from rtc_mjx.team import ALONE
 
         held = config.from_command_line(sys.argv[1:], "test")
-        learner = held.learner(dataset.statistics(held.scene, dataset.demonstrations(held.scene, 64, dataset.TRAIN)))
-        assert train.devices(held, learner).mesh.shape == {"seed": 1, "batch": 3}
+        assert train.devices(held, ALONE).mesh.shape == {"seed": 1, "batch": 3}
         cli.run(lambda _: train.main([*sys.argv[1:], "--devices", "4"]))
     """
     command = [sys.executable, "-c", textwrap.dedent(code), *SMALL, "--seeds", "1", "--batch", "4", "--run", str(tmp_path / "run")]
     done = subprocess.run(command, env=environment(4), capture_output=True, text=True, timeout=LIMIT_S)
+    assert not (tmp_path / "run").exists()
     told, refused = done.stderr.splitlines()
     assert done.returncode == 2 and "3 of 4 devices are used" in told and "can be used: 1, 2, 3" in refused
 

@@ -134,8 +134,8 @@ class Recorded(Driving):
             self.pool(part)
 
     def recordings(self) -> list[str]:
-        """Of each scene its part, its name and a digest of what was logged; those left out are not among them."""
-        return sorted(f"{part} {held}" for part in get_args(Part) for held in self.pool(part).named())
+        """Of each scene its part, its name and a digest of what was logged, in their order; those left out are not among them."""
+        return [f"{part} {held}" for part in get_args(Part) for held in self.pool(part).named()]
 
     def pool(self, part: Part) -> Pool:
         """The scenes of one part.
