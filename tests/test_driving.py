@@ -1,6 +1,7 @@
 """Laws of every generated driving scene, of the road graph and the routes found in it, and of driving's metrics."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -57,6 +58,19 @@ def coast(episode):
     """The intersection's agent with its hands off."""
     scene = made("intersection")
     return rollout(scene, Actor((), lambda m, o, a: (m, a), jnp.zeros((scene.steps, 2))), episode)
+
+
+@pytest.mark.parametrize(
+    ("off", "loss"),
+    [((0.0, 0.0, 0.0), 0.0), ((0.6, 0.0, 0.0), 0.18), ((0.0, -3.0, 0.0), 2.5), ((0.0, 0.0, np.pi), np.hypot(*CAR) - 0.5)],
+)
+def test_reconstruction_is_the_huber_distance_of_the_corners(off, loss):
+    """Of a car that is off by so much from the first step on; where it starts does not count."""
+    still = jnp.tile(jnp.array([5.0, 2.0, 0.3, 0.0]), (6, 1))
+    moved = still.at[1:, :3].add(jnp.array(off))
+    expert, agent = (SimpleNamespace(states=SimpleNamespace(qpos=q)) for q in (still, moved.at[0].add(100.0)))
+    found = made("intersection").discrepancy(SimpleNamespace(trajectory=expert), agent)
+    assert found == pytest.approx(loss, abs=1e-5)
 
 
 # Every driving scene
