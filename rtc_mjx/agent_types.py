@@ -40,6 +40,10 @@ class TypeSpace(Protocol):
         """How many numbers an encoder puts out."""
 
     @property
+    def inference_outputs(self) -> int:
+        """How many numbers InfoMGAIL's Q puts out."""
+
+    @property
     def prior_outputs(self) -> int:
         """How many numbers parametrise the prior."""
 
@@ -66,6 +70,7 @@ class NoType:
     size: int = 0
     points: ClassVar[bool] = False
     posterior_outputs: int = 0
+    inference_outputs: int = 0
     prior_outputs: int = 0
 
     def posterior(self, outputs: Array) -> Gaussian:
@@ -86,14 +91,21 @@ class Continuous:
     Attributes:
         size: dimension of a type.
         components: of the prior.
+        posterior_components: of the encoder's posterior; one is a Gaussian.
     """
 
     size: int
     components: int
+    posterior_components: int = 1
     points: ClassVar[bool] = False
 
     @property
     def posterior_outputs(self) -> int:
+        """Mean and raw scale of each coordinate; of several components also the weight of each."""
+        return 2 * self.size if self.posterior_components == 1 else self.posterior_components * (1 + 2 * self.size)
+
+    @property
+    def inference_outputs(self) -> int:
         """Mean and raw scale of each coordinate."""
         return 2 * self.size
 
@@ -102,8 +114,10 @@ class Continuous:
         """Weight of each component, mean and raw scale of each of its coordinates."""
         return self.components * (1 + 2 * self.size)
 
-    def posterior(self, outputs: Array) -> Gaussian:
-        """A Gaussian whose scale is at least SMALLEST_SCALE, and near 0.7 at outputs of zero."""
+    def posterior(self, outputs: Array) -> Distribution:
+        """A Gaussian whose scale is at least SMALLEST_SCALE, and near 0.7 at outputs of zero; or a mixture of such."""
+        if self.posterior_components > 1:
+            return mixture_of(outputs, self.posterior_components, self.size, SMALLEST_SCALE)
         mean, raw = jnp.split(outputs, 2, axis=-1)
         return Gaussian(mean, scale_of(raw))
 
@@ -142,10 +156,7 @@ class Discrete:
         """One logit a category."""
         return self.size
 
-    @property
-    def prior_outputs(self) -> int:
-        """One logit a category."""
-        return self.size
+    inference_outputs = prior_outputs = posterior_outputs
 
     def posterior(self, outputs: Array) -> OneHot:
         """The categorical distribution of the logits."""

@@ -125,7 +125,8 @@ class Config:
 
 LEAST = {
     **dict.fromkeys(("updates", "seeds", "every.log", "every.test", "every.save", "scene.steps", "scene.road_users"), 1),
-    **{f"model.{name}": 1 for name in ("width", "discriminator_width", "depth", "mixture", "type_size", "prior_components")},
+    **{f"model.{name}": 1 for name in ("width", "discriminator_width", "depth", "mixture", "type_size")},
+    **dict.fromkeys(("model.prior_components", "model.posterior_components"), 1),
     **dict.fromkeys(("batch", "experts.train", "experts.test"), 4),
     **dict.fromkeys(
         ("first_seed", "losses.adversarial_start", "losses.adversarial_ramp", "losses.type_kl_ramp", "optimiser.discriminator_steps"), 0

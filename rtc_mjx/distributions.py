@@ -145,10 +145,16 @@ class Choice(OneHot):
         return jnp.maximum(jax.nn.softmax(self.logits), 1e-12)
 
 
-def kl(p: Distribution, q: Distribution, sample: Array) -> Array:
-    """KL[p || q] in nats: closed form where both are of one kind that has it, else the one-sample estimate at `sample` of p."""
+def kl(p: Distribution, q: Distribution, sample: Array, key: Array) -> Array:
+    """KL[p || q] in nats: closed form where both are of one kind that has it; of a mixture, estimated by a sample of each component.
+
+    Otherwise by `sample`, which is one of p.
+    """
     if type(p) is type(q) and isinstance(p, Gaussian | OneHot):
         return p.kl(q)  # type: ignore[arg-type]  # both are of the same type
+    if isinstance(p, GaussianMixture):
+        each = p.mean + p.scale * random.normal(key, p.mean.shape)  # exact pathwise gradients, those by the weights included
+        return jnp.sum(jax.nn.softmax(p.logits) * jax.vmap(lambda g: p.log_prob(g) - q.log_prob(g))(each))
     return p.log_prob(sample) - q.log_prob(sample)
 
 

@@ -109,8 +109,8 @@ def type_kl(agent: Agent, case: Case, weights: LossWeights) -> Array:
     """L_kl: KL[e(g|tau) || p(g)], whose minimiser over p is the marginal of the encoder; or the paper's literal KL[p || e]."""
     prior, posterior = agent.prior(case.demonstration.trajectory.observations[0]), case.typed.posterior
     if weights.kl_direction == "posterior_prior":
-        return distributions.kl(posterior, prior, case.typed.agent_type)
-    return distributions.kl(prior, posterior, prior.sample(prior.noise(case.key)))
+        return distributions.kl(posterior, prior, case.typed.agent_type, case.key)
+    return distributions.kl(prior, posterior, prior.sample(prior.noise(case.key)), case.key)
 
 
 def type_info(agent: Agent, case: Case, weights: LossWeights) -> Array:

@@ -72,7 +72,7 @@ class Method:
         """The space of its types; `labels`: how many the scene's hand-made types are."""
         spaces: dict[str, TypeSpace] = {
             "none": NoType(),
-            "continuous": Continuous(options.type_size, options.prior_components),
+            "continuous": Continuous(options.type_size, options.prior_components, options.posterior_components),
             "discrete": Discrete(options.type_count),
             "label": Pointing(labels),
         }

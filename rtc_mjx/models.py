@@ -38,6 +38,8 @@ class ModelOptions:
         type_size: dimension of a continuous type.
         type_count: number of discrete types.
         prior_components: of the continuous prior.
+        posterior_components: of the encoder's posterior over continuous types; with more than one it can say "one of these", as of a
+            demonstration that ends before it shows its type.
     """
 
     width: int = 64
@@ -49,6 +51,7 @@ class ModelOptions:
     type_size: int = 4
     type_count: int = 8
     prior_components: int = 8
+    posterior_components: int = 1
 
 
 @pytree
@@ -193,6 +196,6 @@ def make_networks(key: Array, scene: Scene, features: int, space: TypeSpace, opt
         "encoder": lambda: Encoder(pair, space.posterior_outputs, width, options.depth, rngs),
         "prior": lambda: Scores(alone, width, rngs) if space.points else jax.random.normal(rngs(), (space.prior_outputs,)),
         "discriminator": lambda: Reader(pair, [options.discriminator_width] * options.depth, 1, rngs),
-        "inference": lambda: Reader(pair, hidden, space.posterior_outputs, rngs),
+        "inference": lambda: Reader(pair, hidden, space.inference_outputs, rngs),
     }
     return Networks(**{name: build() if name in parts | {"policy"} else None for name, build in builders.items()})

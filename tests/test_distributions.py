@@ -77,11 +77,31 @@ def test_kl_to_a_mixture_is_unbiased():
     """One-sample estimates average to the integral."""
     p, q = CONTINUOUS["gaussian"], CONTINUOUS["mixture"]
     samples = jax.vmap(lambda k: p.sample(p.noise(k)))(random.split(random.key(2), 100_000))
-    estimate = float(jnp.mean(jax.vmap(lambda x: distributions.kl(p, q, x))(samples)))
+    estimate = float(jnp.mean(jax.vmap(lambda x: distributions.kl(p, q, x, random.key(0)))(samples)))
     axis = np.linspace(-8, 8, 801)
     grid = jnp.asarray(np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2))
     lp, lq = (jax.vmap(d.log_prob)(grid) for d in (p, q))
     assert abs(estimate - float(jnp.sum(jnp.exp(lp) * (lp - lq))) * (axis[1] - axis[0]) ** 2) < 0.03
+
+
+def test_kl_of_a_mixture_and_its_gradient_are_unbiased(x64):
+    """The average over draws is the integral, and so is that of the gradient, by the weights too."""
+    p = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), jnp.float64), CONTINUOUS["mixture"])
+    q = GaussianMixture(p.logits[::-1], p.mean + 0.3, 1.2 * p.scale)
+    keys, axis = random.split(random.key(4), 200_000), np.linspace(-8, 8, 401)
+    grid = jnp.asarray(np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2))
+
+    @jax.jit
+    def integral(p):
+        lp, lq = (jax.vmap(d.log_prob)(grid) for d in (p, q))
+        return jnp.sum(jnp.exp(lp) * (lp - lq)) * (axis[1] - axis[0]) ** 2
+
+    value, slope = jax.jit(jax.value_and_grad(lambda p: jnp.mean(jax.vmap(lambda key: distributions.kl(p, q, p.mean[0], key))(keys))))(p)
+    exact, exact_slope = jax.value_and_grad(integral)(p)
+    assert value == pytest.approx(float(exact), abs=0.01)
+    for ours, theirs in zip(jax.tree.leaves(slope), jax.tree.leaves(exact_slope), strict=True):
+        assert np.allclose(ours, theirs, atol=0.02)
+    assert abs(float(distributions.kl(p, p, p.mean[0], keys[0]))) < 1e-12
 
 
 @pytest.mark.parametrize("name", CONTINUOUS)
@@ -122,11 +142,11 @@ def test_straight_through_choice_has_the_sign_of_the_expectations_gradient(x64):
     assert np.all(jax.grad(lambda x: mean_square(x, noise, False))(logits) == 0)
 
 
-@pytest.mark.parametrize("space", [Continuous(3, 4), Discrete(5)])
+@pytest.mark.parametrize("space", [Continuous(3, 4), Continuous(3, 4, 2), Discrete(5)])
 def test_type_spaces_make_finite_distributions_of_their_size(space):
     for make, count in (
         (space.posterior, space.posterior_outputs),
-        (space.inference, space.posterior_outputs),
+        (space.inference, space.inference_outputs),
         (space.prior, space.prior_outputs),
     ):
         for scale in (0.0, 30.0):
