@@ -2,6 +2,7 @@
 
     test episodes, each also driven by other experts -> rollouts under the prior's types and inferred ones: an episode's own, another
     expert's in the same episode, another episode's -> conditional shift is what the last costs beyond the one before
+    those under another episode's types -> apart by what luck let the two experts do
     types, xi and the experts' minds -> probes of I(g; xi) and I(g; mind), each beside its permutation null
     rollouts -> encoded again: do they show the type they were played under?
     many experts and many rollouts of one episode -> conditional realism: p(tau|xi) compared feature by feature, beside its noise floor
@@ -11,6 +12,7 @@ Everything is in bits, rates or the scene's own units, per seed of the run.
 
 import argparse
 import functools
+import itertools
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -37,6 +39,7 @@ from rtc_mjx.trained import Trained, trained
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
 REALISM_BINS, REALISM_EPISODES = 10, 64
+SAID = {True: "yes", False: "no"}
 LEAST_EPISODES = 16  # a probe learns from half of them and is measured on a quarter
 
 
@@ -83,19 +86,41 @@ def analyse(run: Run, episodes: int, experts: int, progress: Callable[[str], eva
         out["realism"] = realism(setup, min(episodes, REALISM_EPISODES), experts, progress("conditional realism"))
     if not setup.learner.method.encodes:
         return out
-    types, information_bits = shift(setup, progress("types")), told_by_types(setup)
-    return out | {"types": types, "information": information_bits, "reencoding": reencoding(setup)}
+    features, expert = played(setup, progress("types"))
+    types, luck = evaluate.score(setup.config, features, expert), by_luck(setup.config.scene, features["shuffled"], expert)
+    return out | {"types": types, "by_luck": luck, "information": told_by_types(setup), "reencoding": reencoding(setup)}
 
 
-def shift(setup: Setup, watch: evaluate.Watch = iter) -> dict[str, dict[str, list[float]]]:
-    """The scene's metrics per source of types, a list over seeds: 'prior', 'paired', 'same_xi', 'shuffled'."""
+def played(setup: Setup, watch: evaluate.Watch = iter) -> tuple[dict[str, evaluate.Features], evaluate.Features]:
+    """Features of rollouts per source of types, 'prior', 'paired', 'same_xi', 'shuffled', and of the experts."""
     scene, test = setup.config.scene, setup.test
     given = evaluate.donors(setup.learner.method, test)
     if scene.redrivable:
         others = dataset.by_others(scene, len(jax.tree.leaves(test)[0]), dataset.TEST, 1)
         given["same_xi"] = jax.tree.map(lambda x: x[:, 0], others.trajectory)
     features = evaluate.roller(setup.learner, scene.samples, watch)(setup.networks, test, given, stream("type shift", 0))
-    return evaluate.score(setup.config, features, evaluate.expert_features(scene, test))
+    return features, evaluate.expert_features(scene, test)
+
+
+def by_luck(scene: Scene, shuffled: evaluate.Features, expert: evaluate.Features) -> dict[str, dict[str, Any]]:
+    """Shuffled types by what luck let two experts do (`decided`): that of the type's own episode, and that of the episode it is played in.
+
+    Where both agree, luck and type match by chance; a difference among the others is conditional shift, and which way it goes.
+
+    Returns:
+        By 'type yes, episode no' and so on: the number of `agents`, and a list over seeds of the scene's first main metric.
+    """
+    here = expert["decided"].astype(bool)
+    there = evaluate.elsewhere(here)
+    seeds = range(len(shuffled["decided"]))
+    arrays = {name: x for name, x in shuffled.items() if name != evaluate.FINITE}
+    metric, out = scene.main_metrics[0], {}
+    for of_type, own in itertools.product((True, False), repeat=2):
+        rows = (there == of_type) & (here == own)
+        theirs = {name: x[rows] for name, x in expert.items()}
+        values = [scene.metrics({name: x[i][:, rows] for name, x in arrays.items()}, theirs)[metric] for i in seeds] if np.any(rows) else []
+        out[f"type {SAID[of_type]}, episode {SAID[own]}"] = {"agents": int(np.sum(rows)), metric: values}
+    return out
 
 
 def inferred(setup: Setup) -> np.ndarray:
@@ -227,7 +252,11 @@ def tables(result: dict[str, Any]) -> list[Table]:
         third = Table("trajectory", "bits", title="how well a trajectory shows its type (median)")
         for name, bits in result["reencoding"].items():
             third.add_row(name.replace("_", " "), _spread(bits))
-        out += [first, second, third]
+        metric = list(next(iter(result["by_luck"].values())))[-1]
+        fourth = Table("did luck let the expert?", "agents", metric, title="shuffled types: of the type, and of the episode")
+        for name, of in result["by_luck"].items():
+            fourth.add_row(name, str(of["agents"]), _spread(of[metric]) if of[metric] else "-")
+        out += [first, fourth, second, third]
     if "realism" not in result:
         return out
     last = Table("feature", "agent", "floor", title="conditional realism: JSD of p(tau|xi) from the experts', bits")

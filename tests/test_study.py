@@ -210,5 +210,8 @@ def test_the_analysis_of_types_says_what_is_there_to_say(method, tmp_path):
         return
     assert set(result["types"]) == {"prior", "paired", "same_xi", "shuffled"}
     assert set(result["information"]) == {"xi", "mind"} and set(result["reencoding"]) == {"demonstration", "rollout", "rollout_elsewhere"}
+    parts = [of for of in result["by_luck"].values() if of["agents"]]
+    whole = sum(of["agents"] * of["return"][0] for of in parts) / 32
+    assert sum(of["agents"] for of in parts) == 32 and whole == pytest.approx(result["types"]["shuffled"]["return"][0])
     with pytest.raises(UsageError, match="--episodes 8"):
         type_shift.main(["--run", str(folder), "--episodes", "8"])
