@@ -24,6 +24,7 @@ from rtc_mjx.scenes.driving import AWAY, CAR, OWN, crossings, nearest_users, ran
 from rtc_mjx.scenes.generated import Generated
 from rtc_mjx.scenes.intersection import cycle
 from rtc_mjx.scenes.routes import BEHIND, NOWHERE, RouteOptions, find_routes
+from rtc_mjx.scenes.sight import SOON, Others, taken
 from rtc_mjx.scenes.traffic import Drivers, Walkers, drive, follow_the_leader, must_stop, slow_for_bends, walk
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
@@ -71,6 +72,31 @@ def test_reconstruction_is_the_huber_distance_of_the_corners(off, loss):
     expert, agent = (SimpleNamespace(states=SimpleNamespace(qpos=q)) for q in (still, moved.at[0].add(100.0)))
     found = made("intersection").discrepancy(SimpleNamespace(trajectory=expert), agent)
     assert found == pytest.approx(loss, abs=1e-5)
+
+
+def around(place, velocity, present=True):
+    return Others(
+        pose=jnp.array([[*place, 0.0]]), size=jnp.array([[4.0, 2.0]]), velocity=jnp.array([velocity], float), yaw_rate=jnp.zeros(1),
+        kind=jnp.array([VEHICLE]), present=jnp.array([present]),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("place", "velocity", "present", "when"),
+    [
+        ((20.0, 10.0), (0.0, -5.0), True, 2.0),  # crosses there in two seconds
+        ((20.0, 10.0), (0.0, 5.0), True, SOON),  # drives away
+        ((20.0, 10.0), (0.0, -5.0), False, SOON),
+        ((20.5, 0.0), (0.0, 0.0), True, 0.0),  # stands there
+        ((24.0, 10.0), (0.0, -5.0), True, 3.5),  # passes at 4 m, 1.5 m more than counts
+        ((20.0, 40.0), (0.0, -5.0), True, SOON),  # is too far away
+    ],
+)
+def test_a_point_of_a_route_is_taken_from_when_somebody_will_be_there(place, velocity, present, when):
+    found = taken(jnp.array([[20.0, 0.0], [200.0, 0.0]]), around(place, velocity, present))
+    assert np.allclose(found, [when, SOON], atol=0.02)
+    slope = jax.grad(lambda x: taken(jnp.array([[20.0, 0.0]]) + x, around(place, velocity, present))[0])(jnp.zeros(2))
+    assert np.all(np.isfinite(slope))
 
 
 # Every driving scene

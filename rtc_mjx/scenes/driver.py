@@ -68,7 +68,7 @@ def expert_driver(key: jax.Array, scene: "Driving", routes: Routes, speeds: tupl
 def way_ahead(route: Float[Array, "numbers"]) -> tuple[Float[Array, "points"], Float[Array, "points 2"]]:
     """Stations in m ahead, and the points of the route there, in the car's frame; the first is beside the car."""
     beside = -route[1] * jnp.stack([route[3], route[2]])  # aside of the route, seen from the car: (sin, cos) of the heading error
-    points = jnp.concatenate([beside[None], route[11:].reshape(-1, 2)])
+    points = jnp.concatenate([beside[None], route[11 : 11 + 2 * len(AHEAD)].reshape(-1, 2)])
     return jnp.array([0.0, *AHEAD]), points
 
 

@@ -258,7 +258,7 @@ class Driving(Scene):
         def see(routes: Routes, qpos: Array, qvel: Array, others: Others) -> Array:
             pose = qpos[:3]
             own = rotate(qvel[:2], -pose[2])
-            ahead = see_routes(routes, routes.signals[time], pose)
+            ahead = see_routes(routes, routes.signals[time], pose, others)
             return jnp.concatenate([own, qvel[2:3], qpos[3:4], ahead.reshape(-1), see_users(others, pose, qvel[:2]).reshape(-1)])
 
         cars = cars_apart(state, self.controlled)

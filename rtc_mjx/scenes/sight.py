@@ -14,9 +14,10 @@ from rtc_mjx.scenes.routes import BEHIND, SPACING, Routes
 from rtc_mjx.scenes.several import the_others
 
 AHEAD = (2.0, 5.0, 8.0, 12.0, 16.0, 20.0, 25.0, 30.0, 40.0, 50.0)  # m along a route, where it is looked at
-ROUTE, USER = 11 + 2 * len(AHEAD), 14  # numbers that are told of a route, and of somebody around
+ROUTE, USER = 11 + 3 * len(AHEAD), 14  # numbers that are told of a route, and of somebody around
 FAR = 60.0  # m, beyond which nothing is told apart
 NEAR, SOON = 15.0, 5.0  # m and s, up to which it is told how close somebody is or will be
+REACH = 2.5  # m around a point of a route, within which somebody is in the way
 OFF_ROUTE = 5.0  # m to the side, beyond which a route is no longer one's own
 
 
@@ -41,12 +42,12 @@ class Others:
     present: Bool[Array, "*batch others"]
 
 
-def see_routes(routes: Routes, signals: Int[Array, "routes"], pose: Float[Array, "3"]) -> Float[Array, "routes 31"]:
+def see_routes(routes: Routes, signals: Int[Array, "routes"], pose: Float[Array, "3"], others: Others) -> Float[Array, "routes 41"]:
     """Each route from a pose.
 
     Per route: 1 (there), m to its left, cosine and sine of the heading error, m to the stop line, red, amber, green, m to the
-    give-way line, and to whom it gives way (0, 1, 2), curvature 10 m ahead, then x and y of the points AHEAD in the car's frame. A
-    route too far to the side is not there, unless it is the nearest.
+    give-way line, and to whom it gives way (0, 1, 2), curvature 10 m ahead, then x and y of the points AHEAD in the car's frame, and
+    the s until somebody is there (`taken`). A route too far to the side is not there, unless it is the nearest.
     """
 
     def see(path: Array, signal: Array, stop: Array, give_way: Array, whom: Array) -> tuple[Array, Array]:
@@ -60,13 +61,23 @@ def see_routes(routes: Routes, signals: Int[Array, "routes"], pose: Float[Array,
             aside, jnp.cos(off), jnp.sin(off), to_stop, 1.0 * (signal == RED), 1.0 * (signal == AMBER), 1.0 * (signal == GREEN),
             to_give, 1.0 * whom, bend,
         ])  # fmt: skip
-        return jnp.concatenate([told, seen.reshape(-1)]), jnp.abs(aside)
+        return jnp.concatenate([told, seen.reshape(-1), taken(points[:, :2], others)]), jnp.abs(aside)
 
     told, aside = jax.vmap(see)(routes.paths, signals, routes.stop, routes.give_way, routes.gives_way_to)
     aside = lax.stop_gradient(jnp.where(routes.valid, aside, jnp.inf))
     there = routes.valid & ((aside < OFF_ROUTE) | (jnp.arange(len(aside)) == jnp.argmin(aside)))
     told = jnp.where(there[:, None], told, 0.0)
     return jnp.concatenate([there[:, None].astype(told.dtype), told], axis=1)
+
+
+def taken(points: Float[Array, "points 2"], others: Others) -> Float[Array, "points"]:
+    """In how many s the first of those around who go straight on will be at each point; SOON if nobody.
+
+    One who passes at more than REACH counts as later by 1 s a metre, so that the number does not jump.
+    """
+    soon, closest = jax.vmap(lambda point: closest_approach(others.pose[:, :2] - point, others.velocity, SOON))(points)
+    when = jnp.where(others.present, soon + jnp.maximum(0.0, closest - REACH), SOON)
+    return jnp.minimum(jnp.min(when, axis=1, initial=SOON), SOON)
 
 
 def see_users(others: Others, pose: Float[Array, "3"], own_velocity: Float[Array, "2"]) -> Float[Array, "others 14"]:
