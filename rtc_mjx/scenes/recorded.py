@@ -27,7 +27,7 @@ from rtc_mjx.logs import RATE, LoggedScene
 from rtc_mjx.logs.convert import Control, Converted, Options
 from rtc_mjx.logs.store import scenes
 from rtc_mjx.pytree import in_parts, pytree
-from rtc_mjx.scenes.base import Actor
+from rtc_mjx.scenes.base import Actor, Features, Ranges
 from rtc_mjx.scenes.driving import CONTROL_EVERY, Driving, Road
 from rtc_mjx.scenes.routes import RouteOptions
 from rtc_mjx.trajectory import Episode
@@ -176,9 +176,9 @@ class Recorded(Driving):
         """The logged driver, who does what was done."""
         return Actor((), lambda memory, observation, action: (memory, action), episode.context.actions), ()
 
-    def metrics(self, features: dict[str, np.ndarray], expert: dict[str, np.ndarray]) -> dict[str, float]:
+    def metrics(self, features: Features, expert: Features, ranges: Ranges | None = None) -> dict[str, float]:
         """Those of driving; the curvature JSD only where lane connectivity was logged."""
-        held = super().metrics(features, expert)
+        held = super().metrics(features, expert, ranges)
         return held if self.connected else {name: value for name, value in held.items() if name != "curvature_jsd"}
 
     def notes(self, episodes: Episode) -> dict[str, int]:
