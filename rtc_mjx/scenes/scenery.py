@@ -1,4 +1,7 @@
-"""What pictures of a driving scene show beside the bodies of its world: kerbs, lanes, crosswalks, stop lines in their signal's colour, and the agents' ways on."""
+"""What pictures of a driving scene show beside the bodies of its world.
+
+Kerbs, lanes, crosswalks, stop lines in their signal's colour, and the agents' ways on.
+"""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
