@@ -49,12 +49,13 @@ def analysis(run: Run) -> dict[str, Any]:
     return held
 
 
-def of_run(run: Run) -> dict[str, Any]:
-    """All that tables and figures need of a run, and what is needed to make it again."""
+def of_run(run: Run, study: str = "") -> dict[str, Any]:
+    """All that tables and figures need of a run, and what is needed to make it again; `study`: which made it."""
     shift, table = analysis(run), settings.to_dict(run.config)
     return {
         **evaluation(run),
         **({"type_shift": shift} if shift else {}),
+        **({"study": study} if study else {}),
         "config": table,
         "options": options(table),
         "curves": curves(run),

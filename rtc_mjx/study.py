@@ -72,7 +72,7 @@ def write(runs: Mapping[str, Run], folder: Path, out: Path, pending: bool = Fals
     """Writes results of runs beside those that are there, then all tables and figures of the folder; returns the tables."""
     with alone(folder):
         for name, run in runs.items():
-            results.write(out, name, results.of_run(run))
+            results.write(out, name, results.of_run(run, out.name))
         return rewritten(out, pending)
 
 

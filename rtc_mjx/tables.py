@@ -195,31 +195,38 @@ def _span(values: Iterable[int]) -> str:
     return str(ordered[0]) if len(ordered) == 1 else f"{ordered[0]} to {ordered[-1]}"
 
 
-def made_by(held: Held, shown: Held, study: str, extra: tuple[str, ...] = ()) -> str:
-    """The commands that make the rows shown, with their commits; a warning where rows are of different code or settings.
+def made_by(held: Held, shown: Held, folder: str, extra: tuple[str, ...] = ()) -> str:
+    """The commands that make the rows shown, with their commits; a warning where rows are of different code.
 
     Args:
         held: all results, by name.
         shown: those of the table.
-        study: the name of the folder.
+        folder: the name of their folder.
         extra: options of the study beside those of the settings.
     """
-    groups: dict[tuple[str, int, tuple[str, ...]], list[str]] = defaultdict(list)
+    groups: dict[tuple[str, str, str, tuple[str, ...]], list[str]] = defaultdict(list)
     for name, record in shown.items():
-        groups[record["scene"], record["seeds"], own_options(name, record)].append(name)
-    lines = []
-    for (scene, count, options), names in groups.items():
-        methods = ",".join(dict.fromkeys(name.partition(",")[0] for name in names))
-        words = ["--scene", scene, "--methods", methods, "--seeds", str(count), *extra, *(["--name", study] if study != scene else [])]
-        lines.append(f"`python -m rtc_mjx.study {shlex.join([*words, *options, '--results', 'results'])}`")
-    told = "Made by " + " and ".join(lines) + "."
-    if any(options for _, _, options in groups):
+        alone = "" if "study" in record else name  # `train` trains one method at a time
+        groups[alone, record["scene"], str(record["seeds"]), own_options(name, record)].append(name)
+    told = "Made by " + " and ".join(_command(*of, names, folder, extra) for of, names in groups.items()) + "."
+    if any(options for *_, options in groups):
         told += " What follows the number of seeds differs from the committed settings."
     commits = {of: [name for name in shown if _commit(shown[name]) == of] for of in dict.fromkeys(map(_commit, shown.values()))}
     told += " Commit " + "; ".join(f"{of} ({', '.join(names)})" if len(commits) > 1 else of for of, names in commits.items()) + "."
     if len({record.get("measured_by") for record in shown.values()}) > 1:
         told += " **Rows were measured by different code**: the study measures again those that it finds finished."
-    return told + f" Tables and figures again from the JSON files: `python -m rtc_mjx.report results/{study}`.\n"
+    return told + f" Tables and figures again, from the JSON files: `python -m rtc_mjx.report results/{folder}`.\n"
+
+
+def _command(
+    alone: str, scene: str, seeds: str, options: tuple[str, ...], names: Sequence[str], folder: str, extra: tuple[str, ...]
+) -> str:
+    methods = ",".join(dict.fromkeys(name.partition(",")[0] for name in names))
+    if alone:
+        return f"`{shlex.join(['python', '-m', 'rtc_mjx.train', '--scene', scene, '--method', methods, '--seeds', seeds, *options])}`"
+    named = ["--name", folder] if folder != scene else []
+    words = ["--scene", scene, "--methods", methods, "--seeds", seeds, *extra, *named, *options, "--results", "results"]
+    return f"`python -m rtc_mjx.study {shlex.join(words)}`"
 
 
 def own_options(name: str, record: Record) -> tuple[str, ...]:
