@@ -122,7 +122,7 @@ def _named_ends(axis: Axes, ends: Mapping[str, float]) -> None:
 
 
 def apart(heights: Sequence[float], gap: float) -> list[float]:
-    """Ascending heights, moved as little as need be so that neighbours are a gap apart, about the same middle."""
+    """Ascending heights in [0, 1], moved as little as need be so that neighbours are a gap apart, about the same middle, and inside."""
     groups: list[list[float]] = []  # of heights that must be moved together: the heights
     for height in heights:
         groups.append([height])
@@ -133,11 +133,12 @@ def apart(heights: Sequence[float], gap: float) -> list[float]:
 
 
 def _bottom(group: Sequence[float], gap: float) -> float:
-    return float(np.mean(group)) - gap * (len(group) - 1) / 2
+    size = gap * (len(group) - 1)
+    return float(np.clip(np.mean(group) - size / 2, 0, max(1 - size, 0)))
 
 
 def _top(group: Sequence[float], gap: float) -> float:
-    return float(np.mean(group)) + gap * (len(group) - 1) / 2
+    return _bottom(group, gap) + gap * (len(group) - 1)
 
 
 def overview(held: Held, file: Path) -> None:
@@ -198,12 +199,13 @@ def ablations(held: Held, file: Path) -> None:
 
 def _values(held: Held, base: str, option: str) -> dict[str, tuple[str, Record]]:
     """Results by the value of an option, in its order: variations, the base at the committed value, the naive hierarchy at share 1."""
-    found = {name.partition("=")[2]: (name, record) for name, record in held.items() if name.startswith(f"{base},{option}=")}
+    found = {}
     if base in held:
         at: Any = held[base]["config"]
         for part in option.replace("-", "_").split("."):
             at = at[part]
         found[str(at)] = (base, held[base])
+    found |= {name.partition("=")[2]: (name, record) for name, record in held.items() if name.startswith(f"{base},{option}=")}
     naive = "naive_hierarchy" + base[-2:]
     if option == "encoder-share" and naive in held:
         found["1.0"] = (naive, held[naive])
@@ -219,13 +221,20 @@ def _variations(axis: Axes, values: Mapping[str, tuple[str, Record]], metric: st
         seeds = np.maximum(record["metrics"][metric]["per_seed"], SMALLEST if logarithmic(metric) else -np.inf)
         axis.plot([place] * len(seeds), seeds, ".", color="0.6", markersize=4, zorder=2)
         means.append(float(np.mean(seeds)))
-        axis.plot(place, means[-1], marker=style(name)["marker"], color="k", markerfacecolor="k" if name == base else "white", zorder=4)
+        axis.plot(
+            place,
+            means[-1],
+            marker=style(name.partition(",")[0])["marker"],
+            color="k",
+            markerfacecolor="k" if name == base else "white",
+            zorder=4,
+        )
     axis.plot(range(len(means)), means, color="k", linewidth=0.8, zorder=3)
     if logarithmic(metric):
         axis.set_yscale("log")
     labels = [f"{value}\n(naive)" if name.startswith("naive") else value.replace("_", "\n") for value, (name, _) in values.items()]
     axis.set_xticks(range(len(labels)), labels, fontsize=7)
-    axis.tick_params(axis="y", labelsize=7)
+    axis.tick_params(axis="y", which="both", labelsize=7)
     axis.grid(alpha=0.25, axis="y")
 
 

@@ -29,7 +29,7 @@ TABLES: Mapping[str, Callable[[Mapping[str, Record], str], str]] = {
 
 def with_source(held: Mapping[str, Record], study: str, text: str) -> str:
     """A table with the commands that make its rows below."""
-    return f"{text}\n{tables.made_by(held, results.finished(held), study)}" if text and results.finished(held) else ""
+    return f"{text}\n{tables.made_by(results.finished(held), study)}" if text and results.finished(held) else ""
 
 
 def rebuild(folder: Path, pending: bool = False) -> str:

@@ -45,7 +45,7 @@ def performance(held: Held, study: str) -> str:
     told = (
         f"Scene {first['scene']}; {_sizes(whole.values())}. {OVER_SEEDS} Intervals over test episodes are in the JSON files (`interval`)."
     )
-    return markdown(rows, left=2) + f"\n{told}\n\n{made_by(held, whole, study)}"
+    return markdown(rows, left=2) + f"\n{told}\n\n{made_by(whole, study)}"
 
 
 def comparisons(held: Held, study: str) -> str:
@@ -65,7 +65,7 @@ def comparisons(held: Held, study: str) -> str:
     rows = [["method", "against", "metric", "seeds", "difference [95 % interval]", "p (sign-flip)", "p (Holm)"]]
     for (name, against, metric, differences), raw, holm in zip(tests, p, corrected, strict=True):
         rows.append([name, against, metric, str(len(differences)), signed(differences.tolist()), f"{raw:.3g}", f"{holm:.3g}"])
-    return markdown(rows, left=3) + f"\nPaired by the number of the seed, under prior types. {TESTED}\n\n{made_by(held, whole, study)}"
+    return markdown(rows, left=3) + f"\nPaired by the number of the seed, under prior types. {TESTED}\n\n{made_by(whole, study)}"
 
 
 def _references(name: str) -> list[str]:
@@ -100,7 +100,7 @@ def type_shift(held: Held, study: str) -> str:
         "(shuffled), of the prior. Conditional shift: shuffled less same_xi, or less paired where nobody else can drive the episode; "
         f"marginal: prior less shuffled. Bits by a held-out probe, a lower bound; null: 95 % of permutations are below. {OVER_SEEDS}"
     )
-    return markdown(rows, left=1) + f"\n{told}\n\n{made_by(held, whole, study)}"
+    return markdown(rows, left=1) + f"\n{told}\n\n{made_by(whole, study)}"
 
 
 def _shift_cells(found: Mapping[str, Mapping], metric: str, sources: Sequence[str]) -> list[str]:
@@ -129,7 +129,7 @@ def conditional_realism(held: Held, study: str) -> str:
         f"JSD in bits between {first['experts']} experts and as many rollouts under prior types in one episode, mean over "
         f"{first['episodes']} episodes. Floor: the same between two groups of experts, in the bins of that row. {OVER_SEEDS}"
     )
-    return markdown(rows, left=1) + f"\n{told}\n\n{made_by(held, whole, study)}"
+    return markdown(rows, left=1) + f"\n{told}\n\n{made_by(whole, study)}"
 
 
 def ablations(held: Held, study: str) -> str:
@@ -151,7 +151,7 @@ def ablations(held: Held, study: str) -> str:
     for (row, metric, raw), holm in zip(tested, corrected, strict=True):
         rows[row][4 + 3 * metrics.index(metric)] = f"{raw:.3g} ({holm:.3g})"
     told = "One option differs from the row of the method's name; differences and tests are against it, paired by seed."
-    return markdown(rows, left=1) + f"\n{told} {OVER_SEEDS} {TESTED}\n\n{made_by(held, results.finished(varied), study, ('--ablations',))}"
+    return markdown(rows, left=1) + f"\n{told} {OVER_SEEDS} {TESTED}\n\n{made_by(results.finished(varied), study)}"
 
 
 def _variation(record: Record, base: Record | None, metrics: Sequence[str]) -> tuple[list[str], dict[str, float]]:
@@ -195,37 +195,35 @@ def _span(values: Iterable[int]) -> str:
     return str(ordered[0]) if len(ordered) == 1 else f"{ordered[0]} to {ordered[-1]}"
 
 
-def made_by(held: Held, shown: Held, folder: str, extra: tuple[str, ...] = ()) -> str:
-    """The commands that make the rows shown, with their commits; a warning where rows are of different code.
+def made_by(shown: Held, folder: str) -> str:
+    """The commands that make the rows of a table, with their commits; a warning where rows are of different code.
 
     Args:
-        held: all results, by name.
-        shown: those of the table.
+        shown: the results in the table.
         folder: the name of their folder.
-        extra: options of the study beside those of the settings.
     """
     groups: dict[tuple[str, str, str, tuple[str, ...]], list[str]] = defaultdict(list)
     for name, record in shown.items():
         alone = "" if "study" in record else name  # `train` trains one method at a time
         groups[alone, record["scene"], str(record["seeds"]), own_options(name, record)].append(name)
-    told = "Made by " + " and ".join(_command(*of, names, folder, extra) for of, names in groups.items()) + "."
+    told = "Made by " + " and ".join(_command(*of, names, folder) for of, names in groups.items()) + "."
     if any(options for *_, options in groups):
         told += " What follows the number of seeds differs from the committed settings."
     commits = {of: [name for name in shown if _commit(shown[name]) == of] for of in dict.fromkeys(map(_commit, shown.values()))}
     told += " Commit " + "; ".join(f"{of} ({', '.join(names)})" if len(commits) > 1 else of for of, names in commits.items()) + "."
     if len({record.get("measured_by") for record in shown.values()}) > 1:
         told += " **Rows were measured by different code**: the study measures again those that it finds finished."
-    return told + f" Tables and figures again, from the JSON files: `python -m rtc_mjx.report results/{folder}`.\n"
+    place = f"results/{folder}" if all("study" in record for record in shown.values()) else "DIR"
+    return told + f" Tables and figures again, from the JSON files of this folder: `python -m rtc_mjx.report {place}`.\n"
 
 
-def _command(
-    alone: str, scene: str, seeds: str, options: tuple[str, ...], names: Sequence[str], folder: str, extra: tuple[str, ...]
-) -> str:
+def _command(alone: str, scene: str, seeds: str, options: tuple[str, ...], names: Sequence[str], folder: str) -> str:
     methods = ",".join(dict.fromkeys(name.partition(",")[0] for name in names))
     if alone:
         return f"`{shlex.join(['python', '-m', 'rtc_mjx.train', '--scene', scene, '--method', methods, '--seeds', seeds, *options])}`"
+    varied = ["--ablations"] if any("," in name for name in names) else []
     named = ["--name", folder] if folder != scene else []
-    words = ["--scene", scene, "--methods", methods, "--seeds", seeds, *extra, *named, *options, "--results", "results"]
+    words = ["--scene", scene, "--methods", methods, "--seeds", seeds, *varied, *named, *options, "--results", "results"]
     return f"`python -m rtc_mjx.study {shlex.join(words)}`"
 
 

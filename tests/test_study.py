@@ -219,6 +219,7 @@ def test_options_of_a_result_give_its_settings_again():
 def test_labels_are_moved_apart_and_no_further():
     assert charts.apart([0.1, 0.5], 0.1) == pytest.approx([0.1, 0.5])
     assert charts.apart([0.5, 0.5, 0.5], 0.1) == pytest.approx([0.4, 0.5, 0.6])
+    assert charts.apart([0.99, 0.99], 0.1) == pytest.approx([0.9, 1.0])  # not above the axes
     moved = charts.apart([0.1, 0.12, 0.21, 0.9], 0.1)
     assert np.all(np.diff(moved) > 0.0999) and np.mean(moved[:3]) == pytest.approx(np.mean([0.1, 0.12, 0.21]))
 
