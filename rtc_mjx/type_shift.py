@@ -33,6 +33,7 @@ from rtc_mjx.files import write_whole
 from rtc_mjx.keys import stream
 from rtc_mjx.models import Networks
 from rtc_mjx.probe import information
+from rtc_mjx.provenance import made_by
 from rtc_mjx.runs import Run
 from rtc_mjx.scenes import Scene, merged
 from rtc_mjx.trained import Trained, trained
@@ -75,7 +76,7 @@ def analyse(run: Run, episodes: int, experts: int, progress: Callable[[str], eva
     count = len(jax.tree.leaves(setup.test)[0])
     if count < LEAST_EPISODES:
         raise UsageError(f"{run.folder}: its scene has {count} test episodes; at least {LEAST_EPISODES} are needed")
-    out: dict[str, Any] = {
+    out: dict[str, Any] = made_by() | {
         "scene": setup.config.scene.name,
         "method": setup.config.method,
         "seeds": setup.config.seeds,
