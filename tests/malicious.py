@@ -164,6 +164,7 @@ def texts() -> dict[str, bytes]:
     lights = {"2": {"state": ["go"] * 91, "time_index": [0] * 91}}
     out |= {
         "many empty roads": json.dumps(held)[:-1] + ', "roads": [' + "{}," * 5_000_000 + "{}]}",
+        "many small roads": json.dumps(held)[:-1] + ', "roads": [' + '{"a":1},' * 900_000 + "{}]}",
         "many empty objects": json.dumps(held | {"objects": [{}] * 200_000}),
         "many lights": json.dumps(held | {"tl_states": {str(i): lights["2"] for i in range(8_000)}}),
         "deep lists": '{"objects": ' + "[" * 1_000_000,
