@@ -63,6 +63,7 @@ def bombs() -> dict[str, bytes]:
     wide = (np.dtype("U9999"), bytes(4 * 9999))
     return {
         "array that claims more than it has": pickle.dumps(array).replace(b"K\x04\x85", b"J\xff\xff\xff\x7f\x85"),
+        "a name with an escape that is none": b"\x80\x04cnu\\Bmpy\nndarray\n.",
         "huge bytes": b"\x80\x04\x8e" + b"\xff" * 7 + b"\x00" + b"x.",
         "huge text": b"\x80\x04\x8d" + b"\xff" * 6 + b"\x00\x00x.",
         "huge memo": b"\x80\x04Nr\xff\xff\xff\x7f.",
