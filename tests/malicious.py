@@ -63,6 +63,7 @@ def bombs() -> dict[str, bytes]:
     wide = (np.dtype("U9999"), bytes(4 * 9999))
     return {
         "array that claims more than it has": pickle.dumps(array).replace(b"K\x04\x85", b"J\xff\xff\xff\x7f\x85"),
+        "a name with an escape that is none": b"\x80\x04cnu\\Bmpy\nndarray\n.",
         "huge bytes": b"\x80\x04\x8e" + b"\xff" * 7 + b"\x00" + b"x.",
         "huge text": b"\x80\x04\x8d" + b"\xff" * 6 + b"\x00\x00x.",
         "huge memo": b"\x80\x04Nr\xff\xff\xff\x7f.",
@@ -164,6 +165,7 @@ def texts() -> dict[str, bytes]:
     lights = {"2": {"state": ["go"] * 91, "time_index": [0] * 91}}
     out |= {
         "many empty roads": json.dumps(held)[:-1] + ', "roads": [' + "{}," * 5_000_000 + "{}]}",
+        "many small roads": json.dumps(held)[:-1] + ', "roads": [' + '{"a":1},' * 900_000 + "{}]}",
         "many empty objects": json.dumps(held | {"objects": [{}] * 200_000}),
         "many lights": json.dumps(held | {"tl_states": {str(i): lights["2"] for i in range(8_000)}}),
         "deep lists": '{"objects": ' + "[" * 1_000_000,

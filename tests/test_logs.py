@@ -484,7 +484,7 @@ def test_an_object_with_one_position_is_there_once_and_heights_are_known(tmp_pat
     held["objects"][0]["position"] = {"x": 1, "y": 2, "z": 3}
     recording = from_bytes(json.dumps(held).encode(), tmp_path)
     assert recording.map.heights and recording.tracks.valid.sum(axis=1).tolist() == [1, 91, 91]
-    assert recording.repairs == {"objects shorter than the others": 1}
+    assert set(recording.repairs) == {"objects shorter than the others", "objects with parts of different lengths, cut to the shortest"}
 
 
 def test_arrays_of_another_shape_than_they_should_have_are_not_read_as_if_they_had_it(tmp_path):
@@ -514,12 +514,36 @@ def test_what_is_dropped_from_a_file_is_counted(tmp_path):
     assert moved.now == 90 and moved.repairs == {"current times outside of the recording, moved to its nearest": 1}
 
 
+def test_two_road_users_do_not_have_one_id(tmp_path):
+    record = recorded.scenario()
+    record.tracks.append(record.tracks[1])
+    with pytest.raises(UsageError, match=r"several tracks with the ids \['12'\]"):
+        from_scenario(record)
+    held = recorded.gpudrive()
+    held["objects"].append(held["objects"][1])
+    recording = from_bytes(json.dumps(held).encode(), tmp_path)
+    assert recording.tracks.ids == ("11", "12", "13", "#3") and sum(recording.repairs.values()) == 1
+
+
 def test_ids_are_one_line_that_can_be_printed(tmp_path):
     held = recorded.scenarionet()
     held["metadata"]["scenario_id"] = "a\nb\ud800" + "c" * 1000
     name = from_bytes(pickle.dumps(held), tmp_path).scenario
     assert name.startswith("a\\nb\\ud800ccc") and name.isprintable() and len(name) < 100
     assert from_scenario(recorded.scenario("a\nb")).scenario == "a\\nb"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_disk_that_fails_anywhere_is_one_line(kind, tmp_path, monkeypatch):
+    file = file_of(kind, tmp_path)
+
+    def failing(*_: object) -> bytes:
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(Path, "read_bytes", failing)
+    monkeypatch.setattr(read.tfrecord, "_record", failing)
+    with pytest.raises(UsageError, match=r"file: it cannot be read: Input/output error"):
+        next(read.recordings(file))
 
 
 def test_what_no_reader_has_foreseen_is_one_line_too(tmp_path, monkeypatch):

@@ -38,7 +38,7 @@ LANES: dict[int, LaneKind] = {1: "freeway", 2: "surface_street", 3: "bike_lane"}
 PLACES = {
     "road_edge": "road_edges", "road_line": "road_lines", "crosswalk": "crosswalks", "speed_bump": "speed_bumps", "driveway": "driveways",
 }  # fmt: skip
-MOST_JSON = 4_000_000  # values of a file, of which each may take a hundred times its text; real files have a quarter of a million
+MOST_JSON = 2_000_000  # values of a file, of which each may take a hundred times its text; real files have a quarter of a million
 FASTEST_STILL = 2.0  # m/s, above which a road user heads where it moves
 
 
@@ -105,7 +105,7 @@ def _to_predict(wanted: Any, objects: int, ask: Plain) -> tuple[int, ...] | None
 
 def _tracks(objects: list[dict[str, Any]], ask: Plain) -> tuple[Tracks, bool]:
     """The road users, and whether the file knows heights."""
-    ids = tuple(name(o.get("id")) or f"#{i}" for i, o in enumerate(objects))
+    ids = _ids(objects, ask)
     times = max((len(o["position"]) for o in objects if isinstance(o.get("position"), list)), default=0)
     out, heights = empty_tracks(ids, times, ask.source), False
     for i, held in enumerate(objects):
@@ -113,8 +113,10 @@ def _tracks(objects: list[dict[str, Any]], ask: Plain) -> tuple[Tracks, bool]:
         place, speed = coordinates(told), coordinates(point_list(held.get("velocity"), "an object's velocity", ask))[:, :2]
         heading = ask.flat(held.get("heading"), "an object's heading")
         valid = ask.flat(held.get("valid"), "an object's valid") == 1
-        count = min(len(place), len(speed), len(heading), len(valid))
+        lengths = {len(place), len(speed), len(heading), len(valid)}
+        count = min(lengths)
         ask.repairs["objects shorter than the others"] += count < times
+        ask.repairs["objects with parts of different lengths, cut to the shortest"] += len(lengths) > 1
         heights |= any("z" in p for p in told[:1])
         marked = (place[:count, :2] == ABSENT).any(axis=1) | (heading[:count] == ABSENT)
         ask.repairs["states at -10000 said to be valid, taken as absent"] += int(np.sum(marked & valid[:count]))
@@ -126,6 +128,17 @@ def _tracks(objects: list[dict[str, Any]], ask: Plain) -> tuple[Tracks, bool]:
         out.pose[..., 3] = np.radians(out.pose[..., 3])
         ask.repairs["headings in degrees, turned into radians"] += int(np.sum(out.valid))
     return out, heights
+
+
+def _ids(objects: list[dict[str, Any]], ask: Plain) -> tuple[str, ...]:
+    """The ids of objects; one that has none, or that of another before it, is named by its place."""
+    out: list[str] = []
+    seen: set[str] = set()
+    for i, known in enumerate(name(o.get("id")) for o in objects):
+        ask.repairs["objects with the id of another, named by their place"] += known in seen
+        out.append(f"#{i}" if not known or known in seen else known)
+        seen |= {known} - {""}
+    return tuple(out)
 
 
 def in_degrees(tracks: Tracks) -> bool:

@@ -11,6 +11,7 @@ here copies or prints a value without counting: see `Machine.charge`, and `Plain
 import io
 import pickletools
 import re
+import warnings
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -272,6 +273,15 @@ OPERATIONS: dict[str, Callable[[Machine, Any], None]] = {
 }  # fmt: skip
 
 
+def _carry_out(machine: Machine, data: bytes) -> None:
+    for count, (operation, argument, _) in enumerate(pickletools.genops(io.BytesIO(data))):
+        if operation.name not in OPERATIONS:
+            raise Refused(f"the operation {operation.name}")
+        if count > MOST_OPERATIONS:
+            raise Refused(f"more than {MOST_OPERATIONS} operations")
+        OPERATIONS[operation.name](machine, argument)
+
+
 def load(data: bytes, source: str) -> Any:
     """The value of a pickle; arrays in it are `Array`, sets are lists.
 
@@ -282,14 +292,11 @@ def load(data: bytes, source: str) -> Any:
     Raises:
         UsageError: it is cut off or damaged, or holds more than plain values and arrays.
     """
-    machine, operation = Machine(len(data)), None
+    machine = Machine(len(data))
     try:
-        for count, (operation, argument, _) in enumerate(pickletools.genops(io.BytesIO(data))):
-            if operation.name not in OPERATIONS:
-                raise Refused(f"the operation {operation.name}")
-            if count > MOST_OPERATIONS:
-                raise Refused(f"more than {MOST_OPERATIONS} operations")
-            OPERATIONS[operation.name](machine, argument)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # pickletools, of odd escapes in names that are refused anyway
+            _carry_out(machine, data)
     except Refused as why:
         raise UsageError(f"{source}: its pickle holds {why}, which no recorded scene needs; it was not carried out") from why
     except (ValueError, IndexError, TypeError, OverflowError) as error:

@@ -1,5 +1,6 @@
 """Files, folders and globs -> a stream of recordings. What a file is, is told by its content, never by its name."""
 
+import contextlib
 import glob
 import os
 from collections.abc import Callable, Iterable, Iterator
@@ -70,12 +71,27 @@ def kind_of(file: Path) -> Kind | Foreign:
     Raises:
         UsageError: it cannot be read, or is empty.
     """
+    with _reading(file):
+        return _kind_of(file)
+
+
+@contextlib.contextmanager
+def _reading(file: Path) -> Iterator[None]:
+    """One line where the disk or the permissions fail.
+
+    Raises:
+        UsageError: the file cannot be read.
+    """
     try:
-        refuse_if(not file.is_file(), str(file), "it is no file")
-        with file.open("rb") as opened:
-            start = opened.read(SHOWN)
+        yield
     except OSError as error:
-        raise UsageError(f"{file}: it cannot be read: {error.strerror}") from error
+        raise UsageError(f"{file}: it cannot be read: {error.strerror or error}") from error
+
+
+def _kind_of(file: Path) -> Kind | Foreign:
+    refuse_if(not file.is_file(), str(file), "it is no file")
+    with file.open("rb") as opened:
+        start = opened.read(SHOWN)
     refuse_if(not start, str(file), "the file is empty")
     if tfrecord.is_tfrecord(start):
         return _record_kind(file)
@@ -152,14 +168,12 @@ def recordings(file: Path, kind: Kind | None = None) -> Iterator[Recording]:
     if isinstance(found, Foreign):
         raise UsageError(f"{file}: a recording is expected ({', '.join(KINDS)}); this is {found.what}")
     refuse_if(kind is not None and kind != found, str(file), f"{kind} is expected; this is {found}")
-    try:
+    with _reading(file):
         if found in WHOLE:
             yield _made(WHOLE[found], _whole(file), str(file))
             return
         for number, payload in enumerate(tfrecord.records(file)):
             yield _made(RECORDS[found], payload, f"{file}, record {number}")
-    except OSError as error:
-        raise UsageError(f"{file}: it cannot be read: {error.strerror}") from error
 
 
 def _made(reader: Callable[[bytes, str], Recording], data: bytes, source: str) -> Recording:

@@ -101,8 +101,10 @@ def _tracks(given: dict[Any, Any], ask: Plain) -> Tracks:
     for i, (track, state, place) in enumerate(zip(tracks, states, places, strict=True)):
         heading, valid = (ask.flat(state.get(what), f"a track's {what}") for what in ("heading", "valid"))
         velocity = ask.rows(state.get("velocity"), 2, "a track's velocity")
-        count = min(len(place), len(heading), len(valid), len(velocity))
+        lengths = {len(place), len(heading), len(valid), len(velocity)}
+        count = min(lengths)
         ask.repairs["tracks shorter than the others"] += count < out.valid.shape[1]
+        ask.repairs["tracks with parts of different lengths, cut to the shortest"] += len(lengths) > 1
         out.kinds[i] = KINDS.get(text(track.get("type")), OTHER)
         out.pose[i, :count, :3], out.pose[i, :count, 3] = place[:count], heading[:count]
         out.velocity[i, :count], out.valid[i, :count] = velocity[:count], valid[:count] > 0

@@ -84,6 +84,8 @@ def parsed(message: Any, payload: bytes, source: str) -> Any:
 
 def _tracks(logged: Any, times: int, source: str, repairs: Counter[str]) -> Tracks:
     out = empty_tracks(tuple(str(t.id) for t in logged), times, source)
+    again = [known for known, count in Counter(out.ids).items() if count > 1]
+    refuse_if(bool(again), source, f"it has several tracks with the ids {again[:5]}; each road user has one of its own")
     for i, track in enumerate(logged):
         states = [
             (s.center_x, s.center_y, s.center_z, s.heading, s.velocity_x, s.velocity_y, s.length, s.width, s.height, s.valid)
