@@ -1,4 +1,4 @@
-"""The study: probes, claims and comparisons by hand, studies that are stopped and go on, the analysis of types end to end."""
+"""The study: claims and comparisons by hand, studies that are stopped and go on."""
 
 import functools
 import json
@@ -9,30 +9,15 @@ import numpy as np
 import pytest
 from learning import SCENE
 
-from rtc_mjx import claims, dataset, evaluate, study, train, type_shift
+from rtc_mjx import claims, dataset, evaluate, study, train
 from rtc_mjx.errors import RunError, UsageError
 from rtc_mjx.methods import METHODS
-from rtc_mjx.probe import ProbeOptions, information
 from rtc_mjx.scenes import SCENES
 
 SMALL = [
     "--scene.steps", str(SCENE.steps), "--updates", "4", "--batch", "8", "--experts.train", "64", "--experts.test", "32",
     "--every.log", "2", "--every.test", "4", "--every.save", "2", "--model.width", "8", "--model.discriminator-width", "8",
 ]  # fmt: skip
-QUICK = ProbeOptions(updates=200, null=6)
-
-
-def test_a_probe_finds_the_bits_that_are_shared_and_none_where_there_are_none():
-    random = np.random.default_rng(0)
-    x = random.standard_normal((1024, 2))
-    noisy = 0.9 * x[:, :1] + np.sqrt(1 - 0.81) * random.standard_normal((1024, 1))
-    bits, null = information(x, noisy, QUICK)
-    assert 0.75 * 1.198 < bits < 1.05 * 1.198  # -log2(1 - 0.9^2) / 2
-    assert np.max(np.abs(null)) < 0.1
-    bit, _ = information(x, np.sign(x[:, :1]), QUICK)
-    assert 0.85 < bit < 1.02
-    nothing, null = information(x, random.standard_normal((1024, 3)), QUICK)
-    assert nothing < np.max(null) + 0.05
 
 
 def run_with(tmp_path, name, **metrics):
@@ -183,35 +168,3 @@ def test_a_folder_in_the_way_is_left_alone(tmp_path):
     with pytest.raises(UsageError, match="in the way"):
         study.complete(study.Entry("bc", "bc"), "double_goal", place)
     assert (place / "thesis.txt").is_file()
-
-
-def test_conditional_realism_by_hand():
-    """Two episodes, two experts and as many again for the floor; the second of two agents does what no expert does in one episode."""
-    theirs = np.array([[1.0, 1.0, 1.0, 1.0], [0.0, 1.0, 1.0, 0.0]])
-    ours = np.array([[[1.0, 0.0], [1.0, 1.0]], [[0.0, 0.0], [0.0, 1.0]]])  # (agents, rollouts, episodes)
-    assert type_shift.compared(ours, theirs) == {"agent": [0.0, 0.5], "floor": 0.0, "range": (0.0, 1.0)}
-    alike = type_shift.compared(np.zeros((1, 2, 2)), np.ones((2, 4)))  # experts who all do the same tell one who does not
-    assert alike == {"agent": [1.0], "floor": 0.0, "range": (0.0, 1.0)}
-    along = type_shift.compared(np.zeros((1, 2, 3, 5)), np.zeros((3, 4, 5)))  # a feature with a value at each of five times
-    assert along == {"agent": [0.0], "floor": 0.0, "range": (0.0, 1e-6)}
-
-
-@pytest.mark.parametrize("method", ["rtc_d", "bc"])
-def test_the_analysis_of_types_says_what_is_there_to_say(method, tmp_path):
-    folder = tmp_path / "run"
-    train.train(train.settings.from_command_line(["--scene", "double_goal", "--method", method, "--run", str(folder), *SMALL], "test"))
-    type_shift.main(["--run", str(folder), "--episodes", "32", "--experts", "4"])
-    result = json.loads((folder / "type_shift.json").read_text())
-    assert (folder / "media" / "type_shift.png").is_file()
-    assert all(len(of["agent"]) == 1 and 0 <= of["floor"] <= 1 for of in result["realism"]["features"].values())
-    assert set(result["realism"]["features"]) == set(SCENE.described_by)
-    if method == "bc":
-        assert "types" not in result
-        return
-    assert set(result["types"]) == {"prior", "paired", "same_xi", "shuffled"}
-    assert set(result["information"]) == {"xi", "mind"} and set(result["reencoding"]) == {"demonstration", "rollout", "rollout_elsewhere"}
-    parts = [of for of in result["by_luck"].values() if of["agents"]]
-    whole = sum(of["agents"] * of["return"][0] for of in parts) / 32
-    assert sum(of["agents"] for of in parts) == 32 and whole == pytest.approx(result["types"]["shuffled"]["return"][0])
-    with pytest.raises(UsageError, match="--episodes 8"):
-        type_shift.main(["--run", str(folder), "--episodes", "8"])
