@@ -202,6 +202,7 @@ class Typed:
 
 
 Source = Callable[["Agent", "Demonstration", Array], Typed]
+Reading = Callable[["Agent", "Demonstration"], Distribution]
 
 
 def scale_of(raw: Array, smallest: float = SMALLEST_SCALE) -> Array:
@@ -233,21 +234,45 @@ def from_prior(agent: "Agent", demonstration: "Demonstration", key: Array) -> Ty
     return Typed(lax.stop_gradient(prior.sample(prior.noise(key))), None)  # p fixed
 
 
+def encoded(agent: "Agent", demonstration: "Demonstration") -> Distribution:
+    """e(g|tau)."""
+    return agent.posterior(demonstration.trajectory)
+
+
+def inferred(agent: "Agent", demonstration: "Demonstration") -> Distribution:
+    """What InfoMGAIL's Q says of a whole trajectory: it sees one step at a time, `pooled` puts the steps together."""
+    track = demonstration.trajectory
+    return agent.space.pooled(agent.inference_outputs(track.observations[:-1], track.actions))
+
+
+def labelled(agent: "Agent", demonstration: "Demonstration") -> Choice:
+    """The hand-made label; where several fit alike, each of them as likely.
+
+    Raises:
+        UsageError: the scene has none.
+    """
+    label = agent.scene.label(demonstration)
+    if label is None:
+        raise UsageError(f"scene {agent.scene.name} has no hand-made labels")
+    return Choice(jnp.log(jnp.maximum(label, 1e-9)))
+
+
+READINGS: dict[str, Reading] = {"encoder": encoded, "inference": inferred, "label": labelled}  # sources that read a trajectory
+
+
 def from_encoder(agent: "Agent", demonstration: "Demonstration", key: Array) -> Typed:
     """g_e ~ e(g|tau), reparameterised: what is lost under g_e flows back into the encoder (paper, eq. 3)."""
-    posterior = agent.posterior(demonstration.trajectory)
+    posterior = encoded(agent, demonstration)
     return Typed(posterior.sample(posterior.noise(key)), posterior)
 
 
 def from_inference(agent: "Agent", demonstration: "Demonstration", key: Array) -> Typed:
     """InfoMGAIL's cloning: the type that Q itself reads off the demonstration, held fixed.
 
-    A randomly paired type would teach the policy to ignore types. Q sees one step at a time: `pooled` puts the steps together.
+    A randomly paired type would teach the policy to ignore types.
     """
-    track = demonstration.trajectory
-    seen = agent.inference_outputs(track.observations[:-1], track.actions)
-    inferred = agent.space.pooled(seen)
-    return Typed(lax.stop_gradient(inferred.sample(inferred.noise(key))), None)
+    held = inferred(agent, demonstration)
+    return Typed(lax.stop_gradient(held.sample(held.noise(key))), None)
 
 
 def from_label(agent: "Agent", demonstration: "Demonstration", key: Array) -> Typed:
@@ -256,10 +281,7 @@ def from_label(agent: "Agent", demonstration: "Demonstration", key: Array) -> Ty
     Raises:
         UsageError: the scene has none.
     """
-    label = agent.scene.label(demonstration)
-    if label is None:
-        raise UsageError(f"scene {agent.scene.name} has no hand-made labels")
-    drawn = Choice(jnp.log(jnp.maximum(label, 1e-9)))
+    drawn = labelled(agent, demonstration)
     return Typed(lax.stop_gradient(drawn.sample(drawn.noise(key))), None)
 
 

@@ -19,7 +19,9 @@ from rtc_mjx.rollout import rollout
 from rtc_mjx.scenes import Scene
 from rtc_mjx.trajectory import Demonstration, Episode
 
-TRAIN, TEST, SECOND_TEST = 0, 1, 2  # seeds of the independent sets: to learn from, to compare with, to compare these with
+TRAIN, TEST, SECOND_TEST, PROBED = range(
+    4
+)  # seeds of the independent sets: to learn from, to compare with, to compare these with, to probe
 CHUNK = 1024  # episodes simulated at once
 
 

@@ -45,11 +45,12 @@ FINITE = "finite"  # the feature that says whether a rollout is
 Donors = dict[str, Trajectory]  # the trajectory that each episode's type is inferred from, by source of types
 Roll = Callable[[Networks, Demonstration, Donors, Array], dict[str, Features]]
 Watch = Callable[[Sequence[Any]], Iterable[Any]]
+RollTrained = Callable[[Demonstration, Donors, Array], dict[str, Features]]
 
 
 def donors(method: Method, test: Demonstration) -> Donors:
-    """What types are inferred from: an episode's own demonstration, or that of another; nothing where no type is inferred."""
-    if not method.encodes:
+    """What types are read off: an episode's own demonstration, or that of another; nothing where no type is read off any."""
+    if not method.reads:
         return {}
     return {"paired": test.trajectory, "shuffled": elsewhere(test.trajectory)}
 
@@ -75,7 +76,8 @@ def roller(learner: Learner, samples: int, watch: Watch = iter, grid: Grid = ONE
         agent = learner.agent(networks)
         draw, noise = random.split(key)
         types = {"prior": learner.types(learner.method.test_types, agent, mine, draw)}
-        types |= {name: learner.types("encoder", agent, Demonstration(mine.episode, track, ()), draw) for name, track in given.items()}
+        reads = learner.method.reads
+        types |= {name: learner.types(reads, agent, Demonstration(mine.episode, track, ()), draw) for name, track in given.items()}
         keys = learner.scene.key_each(noise)
         tracks = {name: learner.play(agent, mine.episode, typed.agent_type, keys) for name, typed in types.items()}
         return {name: learner.scene.features(mine, track) | {FINITE: _finite(track)} for name, track in tracks.items()}
@@ -161,16 +163,23 @@ def evaluate(run: Run, episodes: int, watch: Watch = iter) -> dict[str, Any]:
     )
 
 
-def reaction(
-    learner: Learner, roll: Callable[..., dict[str, Features]], shown: Demonstration, features: dict[str, Features]
-) -> dict[str, dict[str, float]]:
+def reaction(learner: Learner, roll: RollTrained, shown: Demonstration, features: dict[str, Features]) -> dict[str, dict[str, float]]:
+    """The means over seeds of what `reactions` says of rollouts of an evaluation."""
+    told = reactions(learner, roll, shown, features, stream("evaluation", 0))
+    return {who: {name: float(np.mean(values)) for name, values in shares.items()} for who, shares in told.items()}
+
+
+def reactions(
+    learner: Learner, roll: RollTrained, shown: Demonstration, features: dict[str, Features], key: Array
+) -> dict[str, dict[str, list[float]]]:
     """What agents do when luck is turned round at the same type (method notes, section 7), beside the experts with the same minds.
 
-    On as many of the episodes as are simulated at once.
+    On as many of the episodes as are simulated at once; `key` is that of the rollouts that `features` are of.
 
     Returns:
         By who acts: `as_it_was` and `flipped`, the share that did what luck bears on, and `like_expert`, the share whose decision
-        in the flipped episode is that of its expert. Empty where the scene has nothing to turn.
+        in the flipped episode is that of its expert; each a list over seeds (of one value for experts). Empty where the scene has
+        nothing to turn.
     """
     scene = learner.scene
     if scene.flipped(shown.episode) is None:
@@ -180,13 +189,14 @@ def reaction(
     first = jax.tree.map(lambda x: x[:count], shown)
     theirs, before = (reference.expert_features(scene, held)["decided"] for held in (again, first))
     turned = Demonstration(again.episode, first.trajectory, ())
-    flipped = roll(turned, donors(learner.method, turned), stream("evaluation", 0))
+    flipped = roll(turned, donors(learner.method, turned), key)
 
-    def told(before: np.ndarray, after: np.ndarray) -> dict[str, float]:
-        return {"as_it_was": float(np.mean(before)), "flipped": float(np.mean(after)), "like_expert": float(np.mean(after == theirs))}
+    def told(before: np.ndarray, after: np.ndarray) -> dict[str, list[float]]:
+        shares = {"as_it_was": before, "flipped": after, "like_expert": after == theirs}
+        return {name: [float(np.mean(of_seed)) for of_seed in values] for name, values in shares.items()}
 
-    ours = {source: told(features[source]["decided"][:, :, :count], flipped[source]["decided"]) for source in features}
-    return ours | {"expert": told(before, theirs)}
+    ours = {source: told(features[source]["decided"][:, :, :count], flipped[source]["decided"]) for source in flipped}
+    return ours | {"expert": told(before[None], theirs[None])}
 
 
 def _summaries(config: Config, features: Features, expert: Features, values: dict[str, list[float]]) -> dict[str, dict[str, Any]]:

@@ -14,6 +14,7 @@ from rtc_mjx.scenes import Scene
 from rtc_mjx.trajectory import Episode, Trajectory
 
 SHADES = {"paired": "0.25", "shuffled": "0.55", "prior": "0.8"}
+LINES = ("-", "--", "-.", ":")  # actors differ by them too: in print, colours may not
 MARGIN = 0.15  # of what is shown, on every side
 
 
@@ -37,7 +38,8 @@ def paths(axes: Axes, scene: Scene, episode: Episode, tracks: Trajectory, colour
     scene.sketch(axes, episode)
     for actor, way in enumerate(ways):
         own = colours[actor] if colours is not None else colour(actor + 1)
-        axes.plot(*way.T, color=own, linewidth=1.4, alpha=0.85, zorder=10)
+        line = LINES[actor % len(LINES)] if colours is None else "-"
+        axes.plot(*way.T, line, color=own, linewidth=1.4, alpha=0.85, zorder=10)
         axes.plot(*way[-1], "o", color=own, markersize=3.5, zorder=11)
     low, high = ways.min(axis=(0, 1)), ways.max(axis=(0, 1))
     middle, half = (low + high) / 2, max(float(np.max(high - low)) / 2 * (1 + 2 * MARGIN), scene.least_view)
@@ -51,14 +53,24 @@ def results(folder: Path, methods: Sequence[str]) -> dict[str, dict[str, Any]]:
     return {name: json.loads(file.read_text()) for name, file in files.items() if file.is_file()}
 
 
+def shifts(folder: Path, methods: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """What `type_shift` said of the runs of these methods, as far as the results of a study hold it."""
+    return {name: held["type_shift"] for name, held in results(folder, methods).items() if held.get("type_shift")}
+
+
 def by_source(axes: Axes, held: Mapping[str, Mapping[str, Any]], metric: str) -> None:
     """Bars of a metric by source of types, a group a method; dots are seeds, the dashed line is the expert.
 
     Args:
         axes: to draw on.
-        held: results by method, as in results/<scene>/<method>.json.
+        held: results by method, as in results/<scene>/<method>.json; where there are none, that is said.
         metric: its name.
     """
+    axes.set_title(metric.replace("_", " "), fontsize=10)
+    if not held:
+        axes.text(0.5, 0.5, "no results yet", ha="center", va="center", transform=axes.transAxes)
+        axes.set_axis_off()
+        return
     for place, result in enumerate(held.values()):
         sources = [source for source in SHADES if source in result["types"]]
         for index, source in enumerate(sources):
@@ -68,6 +80,5 @@ def by_source(axes: Axes, held: Mapping[str, Mapping[str, Any]], metric: str) ->
     expert = next(iter(held.values()))["reference"]["expert"][metric]
     axes.axhline(expert, color="k", linestyle="--", linewidth=0.8, label="expert")
     axes.set_xticks(range(len(held)), [name.replace("_", "\n") for name in held], fontsize=8)
-    axes.set_title(metric.replace("_", " "), fontsize=10)
     labelled = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
     axes.legend(labelled.values(), labelled.keys(), fontsize=7, framealpha=0.8, edgecolor="none")

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from rtc_mjx.agent_types import Continuous, Discrete, NoType, Pointing, TypeSpace
+from rtc_mjx.agent_types import READINGS, Continuous, Discrete, NoType, Pointing, TypeSpace
 from rtc_mjx.errors import UsageError
 from rtc_mjx.losses import CLOSED_LOOP
 from rtc_mjx.models import ModelOptions
@@ -65,8 +65,13 @@ class Method:
 
     @property
     def encodes(self) -> bool:
-        """Whether types are inferred from demonstrations, so that paired and shuffled types mean something."""
+        """Whether it learns an encoder."""
         return "encoder" in self.parts
+
+    @property
+    def reads(self) -> str:
+        """The source (of `agent_types.READINGS`) that reads a type off a demonstration, for paired and shuffled types; '' without one."""
+        return next((branch.types for branch in self.branches if branch.types in READINGS), "")
 
     def space(self, options: ModelOptions, labels: int = 0) -> TypeSpace:
         """The space of its types; `labels`: how many the scene's hand-made types are."""

@@ -1,15 +1,19 @@
-"""Notebooks run from top to bottom, and are committed without what they print."""
+"""Notebooks run from top to bottom, whatever runs lie about, and are committed without what they print."""
 
+import json
+import shutil
 from pathlib import Path
 
 import nbformat
 import pytest
+from matplotlib.figure import Figure
 from nbclient import NotebookClient
 
-from rtc_mjx import cache
+from rtc_mjx import cache, figures
 
-FOLDER = Path(__file__).resolve().parents[1] / "notebooks"
-NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+ROOT = Path(__file__).resolve().parents[1]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+WITHOUT_RESULTS = "conditional_type_shift"  # the others draw those that are committed
 
 
 def code(notebook):
@@ -23,11 +27,39 @@ def test_notebooks_are_committed_without_outputs(file):
 
 @pytest.mark.parametrize("file", NOTEBOOKS, ids=lambda file: file.stem)
 def test_notebooks_run_and_show_their_figures(file, tmp_path, monkeypatch):
+    """In a folder of their own: `../runs` is not there, so that they train what they show."""
     for name in ("IPYTHONDIR", "JUPYTER_CONFIG_DIR", "JUPYTER_RUNTIME_DIR"):
         monkeypatch.setenv(name, str(tmp_path / name))
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(cache.keep_compiled()))
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    place = tmp_path / "notebooks"
+    place.mkdir()
+    if file.stem != WITHOUT_RESULTS:
+        shutil.copytree(ROOT / "results", tmp_path / "results")
     notebook = nbformat.read(file, as_version=4)
-    NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(FOLDER)}}).execute()
+    NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(place)}}).execute()
     outputs = [output for cell in code(notebook) for output in cell.outputs]
     assert any("image/png" in output.get("data", {}) for output in outputs)
     assert not any(output.get("name") == "stderr" for output in outputs)
+
+
+@pytest.mark.parametrize("file", NOTEBOOKS, ids=lambda file: file.stem)
+def test_notebooks_name_the_whole_study(file):
+    """Another command would make, in the same folders, runs and results that are not those of the other documents."""
+    text = "".join(cell.source for cell in nbformat.read(file, as_version=4).cells if cell.cell_type == "markdown")
+    commands = [line.split() for line in text.splitlines() if "rtc_mjx.study" in line]
+    assert commands and all(
+        [word for word in command if word.startswith("--")] == ["--scene", "--seeds", "--results"] for command in commands
+    )
+
+
+def test_figures_say_where_there_are_no_results_yet(tmp_path):
+    axes = Figure().subplots()
+    figures.by_source(axes, figures.results(tmp_path, ("bc", "rtc_c")), "return")
+    assert [text.get_text() for text in axes.texts] == ["no results yet"]
+
+
+def test_what_type_shift_said_is_found_among_results(tmp_path):
+    (tmp_path / "bc.json").write_text(json.dumps({"metrics": {}}))
+    (tmp_path / "rtc_c.json").write_text(json.dumps({"type_shift": {"metric": "return"}}))
+    assert figures.shifts(tmp_path, ("bc", "mgail", "rtc_c")) == {"rtc_c": {"metric": "return"}}

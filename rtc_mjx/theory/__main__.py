@@ -15,8 +15,6 @@ from rtc_mjx.theory import drawing, learning, printing, solutions, theorem
 
 DRAWN = 0.05  # the epsilon of the figure
 DRAWN_HYPOTHESIS = "deterministic"
-SOLUTIONS = {"1": solutions.solution_1, "2": solutions.solution_2}
-EXAMPLES = {"counterexample to the last step": theorem.counterexample, "breaks the claim": theorem.breaking}
 
 
 def arguments() -> argparse.ArgumentParser:
@@ -51,17 +49,17 @@ def main(argv: Sequence[str] | None = None) -> None:
     cache.keep_compiled()
     console = cli.console()
     expert, settings = solutions.crossing(), learning.grid(learning.EPSILONS, learning.TYPE_KLS, learning.ADVERSARIALS)
-    rows = {(e, n): solutions.measures(expert, solve(expert, e)) for e in learning.EPSILONS for n, solve in SOLUTIONS.items()}
+    rows = {(e, n): solutions.measures(expert, solve(expert, e)) for e in learning.EPSILONS for n, solve in solutions.SOLUTIONS.items()}
     console.print(printing.solutions_table(expert, rows))
     found = {name: theorem.compared(name, options.instances) for name in theorem.HYPOTHESES}
     counts = {name: theorem.census(c) for name, c in found.items()}
-    examples = {name: theorem.example(make) for name, make in EXAMPLES.items()}
+    examples = {name: theorem.example(make) for name, make in theorem.EXAMPLES.items()}
     console.print(printing.theorem_table(counts))
     console.print(printing.examples_table(examples))
     results = {name: learning.sweep(expert, name, settings, options.seeds, options.updates) for name in printing.NAMES}
     console.print(printing.learned_table(expert, results))
     if options.json:
-        write_whole(options.json, json.dumps(printing.as_json(rows, counts, examples, results), indent=1) + "\n")
+        write_whole(options.json, json.dumps(printing.as_json(expert, rows, counts, examples, results), indent=1) + "\n")
     if options.figure:
         drawing.everything(options.figure, expert, found[DRAWN_HYPOTHESIS], results, DRAWN)
 

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax import lax, random
 from jaxtyping import Array, Float, Int
@@ -28,6 +29,7 @@ from rtc_mjx.theory.tables import Expert, TypedAgent
 LARGEST_LOGIT = 6.0  # of D: what the expert never does would make it infinite; a regularised D stays finite too
 ENCODER_SHARE = 0.5  # the paper's f: of what D takes for fakes
 LEARNING_RATE = 0.03  # Adam's; falls to zero along a half cosine
+NEAR = 0.1  # of a solution's luck: so near, an agent counts as there
 SPREAD = 1.0  # standard deviation of the logits at the start
 
 EPSILONS = (0.0, 0.02, 0.05, 0.1)
@@ -153,6 +155,12 @@ class Learned:
         if not jnp.any(here):
             raise UsageError(f"epsilon {epsilon:g} with lambda {adversarial:g} was not swept; see `settings` for what was")
         return jax.tree.map(lambda x: x[jnp.flatnonzero(here)], self)
+
+
+def ends(luck: Float[np.ndarray, "seeds"]) -> dict[str, float]:
+    """The share of agents that end at solution 1 (no luck in types), at solution 2 (all of it), and in between."""
+    first, second = float(np.mean(luck < NEAR)), float(np.mean(luck > 1 - NEAR))
+    return {"solution 1": first, "solution 2": second, "in between": 1 - first - second}
 
 
 @functools.partial(jax.jit, static_argnames=("method", "seeds", "updates"))

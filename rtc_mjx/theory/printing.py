@@ -22,9 +22,17 @@ SOLUTION_HEADS = {
     "error_paired": "error paired",
     "error_prior": "error prior",
 }
-CENSUS_HEADS = ("instances", "I(S,Â) <\nI(S,A)", "reversed", "H(Â|G) <\nI(S,A)", "claim then\nfails")
+CENSUS_HEADS = (
+    "instances",
+    "I(S,Â) <\nI(S,A)",
+    "reversed",
+    "H(A|G) = 0\nin training",
+    "claim then\nfails",
+    "H(Â|G) <\nI(S,A)",
+    "claim then\nfails",
+)
 LAST_STEP_HEADS = ("claim holds,\nlast step fails", "H(Â) ≥ H(A) too,\nlast step fails")
-EXAMPLE_HEADS = ("I(S,A)", "I(S,Â)", "H(A)", "H(Â)", "H(A|S)", "H(Â|S)", "H(Â|G)", "claim", "last step")
+EXAMPLE_HEADS = ("I(S,A)", "I(S,Â)", "H(A)", "H(Â)", "H(A|S)", "H(Â|S)", "H(A|G)", "H(Â|G)", "claim", "last step")
 
 
 def solutions_table(expert: Expert, rows: dict[tuple[float, str], Measures]) -> Table:
@@ -44,10 +52,12 @@ def theorem_table(counts: dict[str, dict[str, int]]) -> Table:
     heads = (*CENSUS_HEADS, *LAST_STEP_HEADS)
     table = _table("Theorem 1: random instances with conditional type shift", "hypothesis", heads)
     for name, row in counts.items():
-        claim, reverse, bounded = (f"{row[k] / max(1, row['instances']):.1%}" for k in ("claim", "reversed", "bounded"))
+        shares = (f"{row[name] / max(1, row['instances']):.1%}" for name in ("claim", "reversed", "determined", "bounded"))
+        claim, reverse, determined, bounded = shares
         failed = f"{row['last_step_fails'] / max(1, row['claim']):.1%}"
         last = f"{row['as_varied_and_last_step_fails']} of {row['as_varied']}"
-        table.add_row(name, str(row["instances"]), claim, reverse, bounded, str(row["bounded_without_claim"]), failed, last)
+        then = (str(row[f"{kind}_without_claim"]) for kind in ("determined", "bounded"))
+        table.add_row(name, str(row["instances"]), claim, reverse, determined, next(then), bounded, next(then), failed, last)
     most = float(theorem.fano(theorem.NEARLY, theorem.ACTIONS)) / BIT
     table.caption = f"Nearly state-blind: but with probability {theorem.NEARLY:g}, so that H(Â|G) is at most {most:.3f} bits."
     return table
@@ -57,27 +67,34 @@ def examples_table(found: dict[str, Comparison]) -> Table:
     """The two instances that were not drawn at random."""
     table = _table("Two instances, in bits", "instance", EXAMPLE_HEADS)
     for name, c in found.items():
-        values = (c.information, c.information_hat, c.entropy, c.entropy_hat, c.noise, c.noise_hat, c.residual_hat)
+        values = (c.information, c.information_hat, c.entropy, c.entropy_hat, c.noise, c.noise_hat, c.residual, c.residual_hat)
         verdicts = ("holds" if held else "fails" for held in (c.claim, c.last_step))
         table.add_row(name, *(f"{float(v) / BIT:.4f}" for v in values), *verdicts)
     return table
 
 
 def learned_table(expert: Expert, results: dict[str, Learned]) -> Table:
-    """Luck in the types and error under the prior, means over seeds."""
+    """Where agents end (`learning.ends`), and their error under the prior, mean over seeds."""
     both = ((method, weight) for method in results for weight in learning.ADVERSARIALS)
     shown = [(method, weight) for method, weight in both if method != "rtc_d" or weight > 0]  # without L_adv RTC is naive
     heads = ("β", "", *(f"{NAMES[m]}\nλ = {x:g}" for m, x in shown))
-    table = _table("Learned: luck in types, error under the prior (means over seeds)", "ε", heads)
+    title = "Learned: % of seeds at solution 1 / in between / at solution 2, and mean error under the prior"
+    table = _table(title, "ε", heads)
     for epsilon in learning.EPSILONS:
         parts = [results[m].along_type_kl(epsilon, x).measures for m, x in shown]
         turn = float(solutions.boundary(expert, epsilon))
         for index, beta in enumerate(learning.TYPE_KLS):
-            cells = (f"{float(np.mean(p.luck[index])):.2f} {float(np.mean(p.error_prior[index])):.3f}" for p in parts)
+            cells = (f"{_ends(np.asarray(p.luck[index]))}  {float(np.mean(p.error_prior[index])):.3f}" for p in parts)
             last = beta == learning.TYPE_KLS[-1]
             table.add_row(f"{epsilon:g}", f"{beta:g}", "< β*" if beta < turn else "", *cells, end_section=last)
-    table.caption = "Luck: I(G;S) / I(S;A), 0 for solution 1, 1 for solution 2. Naive: L_rec + β L_kl + λ L_adv under paired types alone."
+    luck = f"At solution 1: I(G;S) / I(S;A) below {learning.NEAR:g}; at solution 2: above {1 - learning.NEAR:g}."
+    table.caption = f"{luck} Naive: L_rec + β L_kl + λ L_adv under paired types alone."
     return table
+
+
+def _ends(luck: np.ndarray) -> str:
+    held = learning.ends(luck)
+    return "/".join(f"{100 * held[place]:.0f}" for place in ("solution 1", "in between", "solution 2"))
 
 
 def _table(title: str, first: str, others: tuple[str, ...]) -> Table:
@@ -89,15 +106,33 @@ def _table(title: str, first: str, others: tuple[str, ...]) -> Table:
 
 
 def as_json(
-    rows: dict[tuple[float, str], Measures], counts: dict[str, dict[str, int]], two: dict[str, Comparison], results: dict[str, Learned]
+    expert: Expert,
+    rows: dict[tuple[float, str], Measures],
+    counts: dict[str, dict[str, int]],
+    two: dict[str, Comparison],
+    results: dict[str, Learned],
 ) -> dict[str, Any]:
-    """Everything that was found; comparisons in nats, measures in the units that `solutions.Measures` says."""
+    """Everything that was found; comparisons in nats, measures in the units that `solutions.Measures` says.
+
+    Tables are probabilities: `encoder` [state][action][type], `policy` [state][type][action], actions [state][action].
+    """
+
+    def solution(epsilon: float, name: str) -> dict[str, Any]:
+        return jax.tree.map(_listed, solutions.shown(expert, solutions.SOLUTIONS[name](expert, epsilon)))
+
+    examples = {
+        name: {**_plain(c), "tables": jax.tree.map(_listed, theorem.example_tables(theorem.EXAMPLES[name]))} for name, c in two.items()
+    }
     return {
-        "solutions": [{"epsilon": epsilon, "solution": name, **_plain(row)} for (epsilon, name), row in rows.items()],
-        "theorem": {"census": counts, "examples": {name: _plain(c) for name, c in two.items()}},
+        "solutions": [{"epsilon": e, "solution": name, **_plain(row), "tables": solution(e, name)} for (e, name), row in rows.items()],
+        "theorem": {"census": counts, "examples": examples},
         "learned": {m: {"settings": _plain(r.settings), "measures": _plain(r.measures)} for m, r in results.items()},
     }
 
 
+def _listed(x: Any) -> Any:
+    return np.asarray(x).tolist()
+
+
 def _plain(value: Any) -> Any:
-    return jax.tree.map(lambda x: np.asarray(x).tolist(), vars(value))
+    return jax.tree.map(_listed, vars(value))

@@ -130,3 +130,19 @@ def measures(expert: Expert, agent: TypedAgent) -> Measures:
         luck=luck / information,
         mind=(said - luck) / tables.conditional_entropy(expert.joint),
     )
+
+
+SOLUTIONS = {"1": solution_1, "2": solution_2}
+
+
+def shown(expert: Expert, agent: TypedAgent) -> dict[str, Array]:
+    """The agent's tables, and what is played: p(s,a) of the expert, p(s,a_hat) under the types of training and under those of the test."""
+    return {
+        "encoder": agent.encoder,
+        "policy": agent.policy,
+        "prior": agent.prior,
+        "observation": agent.observation,
+        "expert_actions": expert.joint,
+        "training_actions": agent.played(agent.seen_types(expert)),
+        "test_actions": agent.played(agent.prior_types(expert)),
+    }

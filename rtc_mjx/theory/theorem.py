@@ -6,7 +6,8 @@ reconstructs plays the expert), A_hat what it does under types drawn from the pr
 assume more than our notes hold. What the tables say:
 
 - I(S, A_hat) < I(S, A) does *not* follow from conditional shift and a deterministic policy alone: `breaking` is an instance of two
-  states and two types, and more than a third of random ones have it the other way round.
+  states and two types, and more than a third of random ones have it the other way round. Nor does it follow from H(A|G) = 0, that in
+  training the type says the action: `breaking` has that too, since it says nothing of a type in states where it was never met.
 - It does follow where the type leaves less open than the actions tell: I(S, A_hat) <= I(S, A_hat | G) <= H(A_hat | G), G being
   independent of S, so that `residual_hat` < I(S, A) suffices. Solution 2 has a residual of zero; a policy that deviates from "the type
   is the action" with probability at most epsilon has one of at most `fano(epsilon)`.
@@ -55,6 +56,7 @@ class Comparison:
         entropy: H(A).
         entropy_hat: H(A_hat).
         shift: I(G; S), conditional type shift.
+        residual: H(A | G), what the type leaves open in training.
         residual_hat: H(A_hat | G), what the type leaves open at test.
     """
 
@@ -63,6 +65,7 @@ class Comparison:
     entropy: Float[Values, "*batch"]
     entropy_hat: Float[Values, "*batch"]
     shift: Float[Values, "*batch"]
+    residual: Float[Values, "*batch"]
     residual_hat: Float[Values, "*batch"]
 
     @property
@@ -79,6 +82,11 @@ class Comparison:
     def shifted(self) -> Values:
         """The theorem's hypothesis: there is conditional type shift."""
         return self.shift > MARGIN
+
+    @property
+    def determined(self) -> Values:
+        """H(A | G) = 0: in training the type says the action."""
+        return self.residual < MARGIN
 
     @property
     def bounded(self) -> Values:
@@ -117,6 +125,7 @@ def compare(instance: Instance) -> Comparison:
         entropy=tables.entropy(jnp.sum(paired, axis=0)),
         entropy_hat=tables.entropy(jnp.sum(prior, axis=0)),
         shift=tables.conditional_shift(types),
+        residual=tables.conditional_entropy(jnp.einsum("sg,sga->ga", types, policy)),
         residual_hat=tables.conditional_entropy(jnp.einsum("sg,sga->ga", shuffled, policy)),
     )
 
@@ -135,7 +144,7 @@ def counterexample() -> Instance:
 
 
 def breaking() -> Instance:
-    """The claim itself does not hold, though the type can be read off the action and the policy is deterministic (ours, made by hand).
+    """The claim itself does not hold, though in training the type says the action and the action the type (ours, made by hand).
 
     Type 0 heeds the state, but in training it came up in state 0 alone, where that does not show; type 1 does not heed it. Under prior
     types, type 0 meets state 1 and reacts to it: the actions then say more about the state, not less.
@@ -178,6 +187,17 @@ def readable(random: np.random.Generator, count: int) -> Instance:
     return Instance(_types(random, count), np.eye(ACTIONS)[choice])
 
 
+def determined(random: np.random.Generator, count: int) -> Instance:
+    """H(A|G) = 0: in training the type says the action. A third of the pairs of state and type never come up; there, any action."""
+    types = _types(random, count)
+    types = np.where(random.random(types.shape) < 1 / 3, 0.0, types)
+    met = np.any(types > 0, axis=(1, 2), keepdims=True)
+    types = np.where(met, types, 1 / (STATES * TYPE_COUNT))
+    reactions = np.eye(ACTIONS)[random.integers(0, ACTIONS, (count, STATES, TYPE_COUNT))]
+    policy = np.where((types > 0)[..., None], _own_actions(random, count), reactions)
+    return Instance(types / np.sum(types, axis=(1, 2), keepdims=True), policy)
+
+
 def nearly_blind(random: np.random.Generator, count: int) -> Instance:
     """As solution 2, but with probability NEARLY any reaction to the state."""
     policy = (1 - NEARLY) * _own_actions(random, count) + NEARLY * _reactions(random, count)
@@ -193,6 +213,7 @@ HYPOTHESES: dict[str, Generator] = {
     "any policy": any_policy,
     "deterministic": deterministic,
     "deterministic, type in action": readable,
+    "H(A|G) = 0 in training": determined,
     "nearly state-blind": nearly_blind,
     "state-blind (solution 2)": blind,
 }
@@ -208,10 +229,23 @@ def compared(hypothesis: str, instances: int, seed: int = 0) -> Comparison:
 _compare_all = jax.jit(jax.vmap(compare))
 
 
+EXAMPLES: dict[str, Callable[[], Instance]] = {"counterexample to the last step": counterexample, "breaks the claim": breaking}
+
+
 def example(make: Callable[[], Instance]) -> Comparison:
     """The comparison of one given instance, in double precision."""
     with jax.enable_x64(True):
         return jax.device_get(compare(make()))
+
+
+def example_tables(make: Callable[[], Instance]) -> dict[str, np.ndarray]:
+    """The tables of one given instance: q(s,g), the policy, and what is played, p(s,a) in training and p(s,a_hat) at test."""
+    with jax.enable_x64(True):
+        held = make()
+        types, policy = jnp.asarray(held.state_type), jnp.asarray(held.policy)
+        plays = {"training_actions": types, "test_actions": tables.independent(types)}
+        shown = {name: jnp.einsum("sg,sga->sa", joint, policy) for name, joint in plays.items()}
+        return jax.device_get({"state_type": types, "policy": policy, **shown})
 
 
 def census(found: Comparison) -> dict[str, int]:
@@ -221,6 +255,8 @@ def census(found: Comparison) -> dict[str, int]:
         "instances": held,
         "claim": held & found.claim,
         "reversed": held & found.reversed,
+        "determined": held & found.determined,
+        "determined_without_claim": held & found.determined & ~found.claim,
         "bounded": held & found.bounded,
         "bounded_without_claim": held & found.bounded & ~found.claim,
         "last_step_fails": held & found.claim & ~found.last_step,
