@@ -23,8 +23,9 @@ from rtc_mjx.logs.store import scenes
 from rtc_mjx.methods import METHODS
 from rtc_mjx.physics import rest_surroundings, simulate, specialised_step
 from rtc_mjx.runs import RECORDINGS
-from rtc_mjx.scenes.recorded import FOLLOWED, HEADED, Recorded, fitted, part_of
-from rtc_mjx.scenes.recorded import driven as logged
+from rtc_mjx.scenes.pool import FOLLOWED, HEADED, fitted, part_of
+from rtc_mjx.scenes.pool import driven as logged
+from rtc_mjx.scenes.recorded import Recorded
 from rtc_mjx.team import ALONE, Team
 
 STEP, SUBSTEPS = 0.3, 6
@@ -96,12 +97,12 @@ def test_replayed_experts_stay_with_the_log():
 
 def test_parts_share_no_recording_and_leave_none_out():
     scene = made("womd")
-    parts = {part: part_of(scene.converted, part, scene.train_share) for part in ("train", "test")}
-    recorded = {part: {held.name.rsplit("/", 1)[0] for held in held} for part, held in parts.items()}
-    assert recorded["train"] and recorded["test"] and not recorded["train"] & recorded["test"]
-    fewer = part_of(scene.converted[len(scene.converted) // 2 :], "train", scene.train_share)
-    assert {held.name for held in fewer} <= {held.name for held in parts["train"]}  # no recording changes its part for others
-    assert sum(len(held) for held in parts.values()) == len(scene.converted)
+    parts = {part: scene.available(part) for part in ("train", "test")}
+    names = {part: {place.scenario for place in held} for part, held in parts.items()}
+    assert names["train"] and names["test"] and not names["train"] & names["test"]
+    fewer = part_of(sorted(names["train"] | names["test"])[3:], "train", scene.train_share)
+    assert fewer <= names["train"]  # no recording changes its part for others
+    assert sum(len(held) for held in parts.values()) == len(scene.places)
 
 
 def test_recordings_that_are_not_there_leave_no_run_behind(tmp_path):
