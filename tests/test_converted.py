@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from rtc_mjx.errors import UsageError
 from rtc_mjx.logs import AMBER, GREEN, NO_SIGNAL, RED, store, womd
 from rtc_mjx.logs.convert import Options, convert
 from rtc_mjx.logs.road import prepare
@@ -163,3 +164,6 @@ def test_recordings_of_which_nothing_can_be_made_are_listed_with_the_reason(kept
     found = list(store.listed([kept], dataclasses.replace(SMALL, start=5.0)))
     assert len(found) == 3 and all("from 5 s on" in held.refused and not held.scenes for held in found)
     assert sum("from 5 s on" in r.message for r in caplog.records) == 3
+    with pytest.raises(UsageError, match="no scene can be made"):
+        list(store.scenes([kept], dataclasses.replace(SMALL, start=5.0)))
+    assert sum("from 5 s on" in r.message for r in caplog.records) == 6

@@ -104,7 +104,7 @@ def listed(paths: Iterable[str | Path], options: Options) -> Iterator[Listed]:
 
 
 def conversions(file: Path, options: Options, wanted: Container[int] | None = None) -> Iterator[tuple[int, Conversion]]:
-    """The recordings of a file of which there are scenes, or could be: the number of each and what it became.
+    """The recordings of a file that became something: the number of each and what; the others are said and passed over.
 
     Args:
         file: the file.
@@ -116,12 +116,22 @@ def conversions(file: Path, options: Options, wanted: Container[int] | None = No
     """
     if folder := _kept(file, options):
         for number, item in enumerate(json.loads((folder / INDEX).read_text())):
-            if "refused" not in item and (wanted is None or number in wanted):
+            if "refused" in item:
+                _say(item["refused"], wanted)
+            elif wanted is None or number in wanted:
                 yield number, unpack((folder / item["file"]).read_bytes())
         return
     for number, (_, became) in enumerate(converted(file, options)):
-        if isinstance(became, Conversion) and (wanted is None or number in wanted):
+        if isinstance(became, UsageError):
+            _say(str(became), wanted)
+        elif wanted is None or number in wanted:
             yield number, became
+
+
+def _say(refused: str, wanted: Container[int] | None) -> None:
+    """Why there is nothing of a recording; who asks for some of them has been told (`listed`)."""
+    if wanted is None:
+        _log.warning("%s", refused)
 
 
 def _kept(file: Path, options: Options) -> Path | None:

@@ -199,12 +199,12 @@ class Recorded(Driving):
     def metrics(self, features: dict[str, np.ndarray], expert: dict[str, np.ndarray]) -> dict[str, float]:
         """Those of driving; off-road time over scenes with road edges, the curvature JSD over those whose lane connectivity is logged."""
         held, bounded = super().metrics(features, expert), features["bounded"]
-        held["offroad_time"] = float(np.sum(features["offroad"] * bounded) / max(1, np.sum(bounded)))
+        held["offroad_time"] = float(np.sum(features["offroad"], where=bounded.astype(bool)) / max(1, np.sum(bounded)))
         return held if self.bends else {name: value for name, value in held.items() if name != "curvature_jsd"}
 
     @functools.cached_property
     def bends(self) -> bool:
-        """Whether either part has scenes whose lane connectivity is logged: without them there is no curvature to compare."""
+        """Whether both parts have scenes whose lane connectivity is logged: without them there is no curvature to compare."""
         return all(np.any(self.pool(part).connected) for part in PARTS)
 
     def notes(self, episodes: Episode) -> dict[str, int]:
