@@ -2,8 +2,7 @@
 
 Three rollouts of the same test episodes (method notes, section 7): types from each episode's own demonstration (paired), from
 another episode's (shuffled), from the prior. Paired to shuffled is conditional shift, shuffled to prior is marginal shift. The
-expert, and expert against expert, stand beside them: the ceiling, and the floor of every divergence. Experts drive each episode
-once; where an agent drives it several times, the floor of its divergence is lower, by what `metrics.jsd` says of sizes.
+expert, and expert against expert, stand beside them: the ceiling, and the floor of every divergence (`rtc_mjx.reference`).
 """
 
 import argparse
@@ -23,7 +22,7 @@ from jaxtyping import Array
 from rich.console import Console
 from rich.table import Table
 
-from rtc_mjx import cache, cli, dataset, metrics
+from rtc_mjx import cache, cli, dataset, metrics, reference
 from rtc_mjx.challenge import challenge
 from rtc_mjx.config import Config
 from rtc_mjx.errors import DivergedError, UsageError
@@ -35,15 +34,13 @@ from rtc_mjx.models import Networks
 from rtc_mjx.provenance import made_by, of_recordings
 from rtc_mjx.pytree import in_parts
 from rtc_mjx.runs import Run
-from rtc_mjx.scenes import Recorded, Scene
+from rtc_mjx.scenes import Features, Recorded
 from rtc_mjx.sharding import ONE_DEVICE, Grid
 from rtc_mjx.trained import trained
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
 AT_ONCE = 2048  # rollouts simulated at once
 FINITE = "finite"  # the feature that says whether a rollout is
-Features = dict[str, np.ndarray]
-
 
 Donors = dict[str, Trajectory]  # the trajectory that each episode's type is inferred from, by source of types
 Roll = Callable[[Networks, Demonstration, Donors, Array], dict[str, Features]]
@@ -109,13 +106,8 @@ def _finite(track: Trajectory) -> Array:
     return jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(track)]))
 
 
-def expert_features(scene: Scene, test: Demonstration) -> Features:
-    """Features of the test demonstrations."""
-    return jax.device_get(jax.jit(jax.vmap(lambda held: scene.features(held, held.trajectory)))(dataset.without_truth(test)))
-
-
 def score(config: Config, features: dict[str, Features], expert: Features) -> dict[str, dict[str, list[float]]]:
-    """Metrics per type source, a list over seeds.
+    """Metrics per type source, a list over seeds; `expert` as in `rtc_mjx.reference.experts`.
 
     Raises:
         DivergedError: a rollout is not finite; a mean over the others would hide it.
@@ -138,11 +130,11 @@ def evaluate(run: Run, episodes: int, watch: Watch = iter) -> dict[str, Any]:
     """All of evaluation.json for a run's last whole checkpoint; `watch` goes through the parts of the work."""
     held = trained(run)
     config, learner, networks = held.config, held.learner, held.networks
-    tests = [dataset.demonstrations(config.scene, episodes, seed) for seed in (dataset.TEST, dataset.SECOND_TEST)]
-    roll, shown = roller(learner, config.scene.samples, watch), dataset.without_truth(tests[0])
+    test = dataset.demonstrations(config.scene, episodes, dataset.TEST)
+    roll, shown = roller(learner, config.scene.samples, watch), dataset.without_truth(test)
     given = donors(learner.method, shown)
     features = roll(networks, shown, given, stream("evaluation", 0))
-    expert, second = (expert_features(config.scene, test) for test in tests)
+    expert, second = (made(config.scene, episodes) for made in (reference.experts, reference.more_experts))
     table = score(config, features, expert)
     means = {source: _summaries(config, features[source], expert, table[source]) for source in table}
     scene = config.scene
@@ -156,21 +148,21 @@ def evaluate(run: Run, episodes: int, watch: Watch = iter) -> dict[str, Any]:
             "scene": config.scene.name,
             "method": config.method,
             "seeds": config.seeds,
-            "episodes": len(next(iter(expert.values()))),
+            "episodes": next(iter(expert.values())).shape[1],
             "asked": episodes,
             "update": held.update,
             "metrics": means["prior"],
             "types": means,
-            "reaction": reaction(learner, functools.partial(roll, networks), shown, features, expert),
+            "reaction": reaction(learner, functools.partial(roll, networks), shown, features),
             "ranges": config.scene.ranges(expert),
-            "notes": {what: count for what, count in config.scene.notes(tests[0].episode).items() if count},
+            "notes": {what: count for what, count in config.scene.notes(test.episode).items() if count},
             "reference": {"expert": config.scene.metrics(expert, expert), "expert_vs_expert": config.scene.metrics(second, expert)},
         }
     )
 
 
 def reaction(
-    learner: Learner, roll: Callable[..., dict[str, Features]], shown: Demonstration, features: dict[str, Features], expert: Features
+    learner: Learner, roll: Callable[..., dict[str, Features]], shown: Demonstration, features: dict[str, Features]
 ) -> dict[str, dict[str, float]]:
     """What agents do when luck is turned round at the same type (method notes, section 7), beside the experts with the same minds.
 
@@ -183,11 +175,11 @@ def reaction(
     scene = learner.scene
     if scene.flipped(shown.episode) is None:
         return {}
-    count = part_size(len(next(iter(expert.values()))), scene.samples)
+    count = part_size(len(jax.tree.leaves(shown)[0]), scene.samples)
     again = dataset.without_truth(dataset.redriven(scene, count, dataset.TEST, scene.flipped))
-    theirs, before = expert_features(scene, again)["decided"], expert["decided"][:count]
-    track = jax.tree.map(lambda x: x[:count], shown.trajectory)
-    turned = Demonstration(again.episode, track, ())
+    first = jax.tree.map(lambda x: x[:count], shown)
+    theirs, before = (reference.expert_features(scene, held)["decided"] for held in (again, first))
+    turned = Demonstration(again.episode, first.trajectory, ())
     flipped = roll(turned, donors(learner.method, turned), stream("evaluation", 0))
 
     def told(before: np.ndarray, after: np.ndarray) -> dict[str, float]:
@@ -199,13 +191,14 @@ def reaction(
 
 def _summaries(config: Config, features: Features, expert: Features, values: dict[str, list[float]]) -> dict[str, dict[str, Any]]:
     """Of each metric: per seed, mean, standard deviation, and a bootstrap interval of the mean over test episodes."""
+    ranges = config.scene.ranges(expert)
 
     def means_over_seeds(rows: np.ndarray) -> np.ndarray:
-        reference = {k: v[rows] for k, v in expert.items()}
+        theirs = {k: v[:, rows] for k, v in expert.items()}
         drawn = [{k: v[i][:, rows] for k, v in features.items()} for i in range(config.seeds)]
-        return np.mean([list(config.scene.metrics(d, reference).values()) for d in drawn], axis=0)
+        return np.mean([list(config.scene.metrics(d, theirs, ranges).values()) for d in drawn], axis=0)
 
-    low, high = metrics.bootstrap(np.arange(len(next(iter(expert.values())))), means_over_seeds, draws=200)
+    low, high = metrics.bootstrap(np.arange(next(iter(expert.values())).shape[1]), means_over_seeds, draws=200)
     out = {}
     for (name, per_seed), *interval in zip(values.items(), low, high, strict=True):
         spread = float(np.std(per_seed, ddof=1)) if len(per_seed) > 1 else 0.0

@@ -32,11 +32,10 @@ def _relative_entropy(p: np.ndarray, q: np.ndarray) -> float:
 def bootstrap(values: np.ndarray, statistic: Callable[[np.ndarray], Any] = np.mean, *, draws: int = 1000) -> tuple[Any, Any]:
     """The 95 % percentile interval of a statistic (a number, or an array of them) over resampled rows of `values`.
 
-    The draws are always the same. The interval is widened to hold the statistic itself where need be: resampling biases a
-    divergence upwards.
+    The draws are always the same. Resampling biases some statistics, such as a divergence, upwards: the interval is moved back by the
+    difference between the mean of the draws and the statistic itself.
     """
     random = np.random.default_rng(0)
-    resampled = [statistic(values[random.integers(0, len(values), len(values))]) for _ in range(draws)]
-    low, high = np.percentile(resampled, [2.5, 97.5], axis=0)
-    whole = statistic(values)
-    return np.minimum(low, whole), np.maximum(high, whole)
+    resampled = np.array([statistic(values[random.integers(0, len(values), len(values))]) for _ in range(draws)])
+    low, high = np.percentile(resampled, [2.5, 97.5], axis=0) + statistic(values) - np.mean(resampled, axis=0)
+    return low, high

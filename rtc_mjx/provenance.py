@@ -12,13 +12,33 @@ from typing import Any
 from rtc_mjx import __version__
 
 PACKAGES = ("mujoco", "mujoco-mjx", "jax", "flax", "optax")  # that a result names
+MEASURING = (
+    "evaluate.py",
+    "metrics.py",
+    "challenge.py",
+    "type_shift.py",
+    "carried.py",
+    "realism.py",
+    "probe.py",
+    "scenes/*.py",
+    "sim_agents/*.py",
+)
 NUMERIC = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")  # that numbers depend on, to the last bit
 
 
 def made_by() -> dict[str, Any]:
-    """`versions` of the packages and `commit` of the checkout that this code runs from (None where there is none)."""
+    """`versions` of the packages, `commit` of the checkout that this code runs from (None where there is none), and `measured_by`."""
     versions = {"python_package": __version__, **{name: metadata.version(name) for name in PACKAGES}}
-    return {"versions": versions, "commit": _commit()}
+    return {"versions": versions, "commit": _commit(), "measured_by": measured_by()}
+
+
+def measured_by() -> str:
+    """A hash of the code that measures what was trained: results under another hash are made again, not mixed with those under this one."""
+    here, total = Path(__file__).parent, hashlib.sha256()
+    for pattern in MEASURING:
+        for file in sorted(here.glob(pattern)):
+            total.update(file.read_bytes())
+    return total.hexdigest()[:12]
 
 
 def versions() -> dict[str, str]:

@@ -25,6 +25,7 @@ from rtc_mjx.files import write_whole
 
 KEPT = 3  # checkpoints
 RECORDINGS = "recordings.json"  # which the run learns from and is tested on, where its scene has any
+PARTS = ("checkpoints", "media")
 
 
 class Run:
@@ -40,21 +41,21 @@ class Run:
 
     @classmethod
     def create(cls, config: Config) -> "Run":
-        """Makes the directory.
+        """Makes the directory; its settings are written last, so that a directory with settings is whole.
 
         Raises:
-            UsageError: it exists and is not empty; nothing is ever overwritten.
+            UsageError: it exists, and holds more than what was left of making it; nothing is ever overwritten.
         """
         folder = config.folder
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if folder.exists() and not unbegun(folder):
             raise UsageError(f"--run {folder} exists: go on with --resume, or name another")
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            settings.write(config, folder)
+            for part in PARTS:
+                (folder / part).mkdir(parents=True, exist_ok=True)
+            (folder / RECORDINGS).unlink(missing_ok=True)  # of a making that was stopped
             if recordings := config.scene.recordings():
                 write_whole(folder / RECORDINGS, json.dumps(recordings, indent=1) + "\n")
-            for part in ("checkpoints", "media"):
-                (folder / part).mkdir()
+            settings.write(config, folder)
         except OSError as error:
             raise UsageError(f"--run {folder}: {error.strerror}") from error
         return cls(folder, config)
@@ -200,6 +201,14 @@ class Run:
             except BlockingIOError:
                 raise UsageError(f"--run {self.folder}: another process is training there") from None
             yield
+
+
+def unbegun(folder: Path) -> bool:
+    """Whether a directory is empty, or holds only what is left where making a run was stopped before its settings were written."""
+    if not folder.is_dir():
+        return False
+    made = {RECORDINGS, *PARTS, *(f".{name}.part" for name in (RECORDINGS, "config.json"))}
+    return all(part.name in made and not (part.is_dir() and any(part.iterdir())) for part in folder.iterdir())
 
 
 class Follower(Run):

@@ -19,7 +19,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from rtc_mjx import cache, cli, dataset, evaluate, provenance, sharding
+from rtc_mjx import cache, cli, dataset, evaluate, provenance, reference, sharding
 from rtc_mjx import config as settings
 from rtc_mjx.cluster import joined
 from rtc_mjx.config import Config
@@ -160,7 +160,7 @@ class Tests:
     def __init__(self, config: Config, learner: Learner, grid: Grid) -> None:
         self.config, self.grid, self.roll = config, grid, evaluate.roller(learner, config.scene.samples, grid=grid)
         demonstrations = dataset.demonstrations(config.scene, config.experts.test, dataset.TEST)
-        self.expert = evaluate.expert_features(config.scene, demonstrations)
+        self.expert = reference.experts(config.scene, config.experts.test)
         self.episodes = dataset.without_truth(demonstrations)
         self.donors = evaluate.donors(learner.method, self.episodes)
 

@@ -26,13 +26,14 @@ from jax import lax, random
 from jaxtyping import Array
 from rich.table import Table
 
-from rtc_mjx import cache, cli, dataset, evaluate, metrics
+from rtc_mjx import cache, cli, dataset, evaluate, metrics, reference
 from rtc_mjx.agent_types import SOURCES
 from rtc_mjx.errors import UsageError
 from rtc_mjx.files import write_whole
 from rtc_mjx.keys import stream
 from rtc_mjx.models import Networks
 from rtc_mjx.probe import information
+from rtc_mjx.provenance import made_by
 from rtc_mjx.runs import Run
 from rtc_mjx.scenes import Scene, merged
 from rtc_mjx.trained import Trained, trained
@@ -75,7 +76,7 @@ def analyse(run: Run, episodes: int, experts: int, progress: Callable[[str], eva
     count = len(jax.tree.leaves(setup.test)[0])
     if count < LEAST_EPISODES:
         raise UsageError(f"{run.folder}: its scene has {count} test episodes; at least {LEAST_EPISODES} are needed")
-    out: dict[str, Any] = {
+    out: dict[str, Any] = made_by() | {
         "scene": setup.config.scene.name,
         "method": setup.config.method,
         "seeds": setup.config.seeds,
@@ -87,7 +88,10 @@ def analyse(run: Run, episodes: int, experts: int, progress: Callable[[str], eva
     if not setup.learner.method.encodes:
         return out
     features, expert = played(setup, progress("types"))
-    types, luck = evaluate.score(setup.config, features, expert), by_luck(setup.config.scene, features["shuffled"], expert)
+    types, luck = (
+        evaluate.score(setup.config, features, reference.experts(setup.config.scene, episodes)),
+        by_luck(setup.config.scene, features["shuffled"], expert),
+    )
     return out | {"types": types, "by_luck": luck, "information": told_by_types(setup), "reencoding": reencoding(setup)}
 
 
@@ -99,7 +103,7 @@ def played(setup: Setup, watch: evaluate.Watch = iter) -> tuple[dict[str, evalua
         others = dataset.by_others(scene, len(jax.tree.leaves(test)[0]), dataset.TEST, 1)
         given["same_xi"] = jax.tree.map(lambda x: x[:, 0], others.trajectory)
     features = evaluate.roller(setup.learner, scene.samples, watch)(setup.networks, test, given, stream("type shift", 0))
-    return features, evaluate.expert_features(scene, test)
+    return features, reference.expert_features(scene, test)
 
 
 def by_luck(scene: Scene, shuffled: evaluate.Features, expert: evaluate.Features) -> dict[str, dict[str, Any]]:

@@ -1,246 +1,155 @@
 """Damaged and malicious recordings: each gives scenes or one `UsageError` that names the file, in bounded time and memory.
 
-python -m tests.fuzz_logs --count 1000      # of each format; uses the recordings of ../shared/data where they are there
+python -m tests.fuzz_logs --count 1000                      # of each format, of the recordings of ../shared/data where they are there
+python -m tests.fuzz_logs --kind scenarionet --first 417 --count 1   # one of them again
 """
 
 import argparse
-import copy
-import json
-import pickle
+import contextlib
+import faulthandler
+import functools
 import random
 import resource
+import signal
 import sys
 import tempfile
 import time
+import traceback
 import warnings
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from rtc_mjx.errors import UsageError
-from rtc_mjx.logs import messages, read
+from rtc_mjx.logs import read
 from rtc_mjx.logs.convert import Options, convert
-from tests.recorded import SHARED, tfrecord, written
+from tests.damage import mutated
+from tests.recorded import SHARED, written
 
-JUNK: list[Any] = [
-    None, True, -1, 0, 2**31, 2**63, -(2**63) - 1, 10**400, 1e308, float("nan"), float("inf"), "", "x" * 1000, "é", b"\x00", [], {}, [[]],
-    [None], [[1.0]] * 50, {"a": 1}, [1e300] * 91, [float("nan")] * 91, ("a", 1),
-]  # fmt: skip
 FORMATS = read.KINDS
+LONGEST = 10.0  # s, that a file of a few megabytes may take, conversion included
+LARGEST = 400  # MB, that it may take beside what the process has
+MOST = 2500  # MB of addresses, with which it is stopped: libraries reserve some that they never use
+STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
-def mutated(kind: str, data: bytes, draw: random.Random) -> bytes:
-    """A damaged copy of a file."""
-    ways: list[Callable[[], bytes]] = [lambda: _bytes(data, draw)]
-    if kind in ("womd_scenario", "womd_tf_example"):
-        ways += [lambda: tfrecord(_bytes(data[12:-4], draw)), lambda: tfrecord(_fields(kind, data[12:-4], draw))] * 2
-    elif kind == "gpudrive_json":
-        ways += [lambda: json.dumps(_tree(json.loads(data), draw), default=str).encode()] * 2
-    else:
-        ways += [lambda: _repickled(data, draw)] * 2
-    return draw.choice(ways)()
+class TooLongError(BaseException):
+    """A file takes longer than it may; no `Exception`, so that no reader takes it for damage."""
 
 
-def _bytes(data: bytes, draw: random.Random) -> bytes:
-    """Bits flipped, cut off, taken out, doubled, moved, or lengths made huge."""
-    out, at = bytearray(data), draw.randrange(len(data))
-    span = slice(at, at + draw.choice([1, 4, 27, 1000]))
-    way = draw.randrange(6)
-    if way == 0:
-        for _ in range(draw.choice([1, 3, 30])):
-            out[draw.randrange(len(out))] ^= 1 << draw.randrange(8)
-    elif way == 1:
-        del out[at:]
-    elif way == 2:
-        del out[span]
-    elif way == 3:
-        out[at:at] = out[span] * draw.choice([1, 100])
-    elif way == 4:
-        out[span] = draw.choice([b"\xff" * 9 + b"\x7f", b"\xff\xff\xff\x7f", b"\x00" * 8, b"\x12\x00" * 5000, draw.randbytes(8)])
-    else:
-        piece = bytes(out[span])
-        del out[span]
-        at = draw.randrange(len(out) + 1)
-        out[at:at] = piece
-    return bytes(out)
+@dataclass
+class Told:
+    """What became of many files.
 
+    Attributes:
+        outcomes: "scenes", "error", "unforeseen" where only the last resort of `read` gave the line, or what was raised.
+        slowest: s, of one file.
+        largest: MB, that one file took beside what the process had.
+        kept: where the files are that gave neither scenes nor a reader's own line.
+    """
 
-def _fields(kind: str, payload: bytes, draw: random.Random) -> bytes:
-    """Fields of the message removed, doubled, reordered or set to something odd, anywhere in it."""
-    message = (messages.Scenario if kind == "womd_scenario" else messages.Example).FromString(payload)
-    for _ in range(draw.choice([1, 1, 5])):
-        _one_field(message, draw)
-    return bytes(message.SerializeToString())
+    outcomes: Counter[str] = field(default_factory=Counter)
+    slowest: float = 0.0
+    largest: float = 0.0
+    kept: list[Path] = field(default_factory=list)
 
-
-def _one_field(message: Any, draw: random.Random) -> None:
-    while True:
-        set_here = message.ListFields()
-        if not set_here:
-            return
-        field, value = draw.choice(set_here)
-        repeated = field.is_repeated
-        if field.message_type is not None and draw.random() < 0.7:
-            message = draw.choice(value) if repeated else value
-            continue
-        return _odd(message, field, value, draw) if not repeated else _odd_list(message, field, value, draw)
-
-
-def _odd(message: Any, field: Any, value: Any, draw: random.Random) -> None:
-    if field.message_type is not None or draw.random() < 0.3:
-        message.ClearField(field.name)
-        return
-    for junk in draw.sample(JUNK, len(JUNK)):
-        try:
-            setattr(message, field.name, junk)
-            return
-        except (TypeError, ValueError, OverflowError):
-            continue
-
-
-def _odd_list(message: Any, field: Any, value: Any, draw: random.Random) -> None:
-    items = list(value)
-    way = draw.randrange(5)
-    if way == 0:
-        items = []
-    elif way == 1:
-        draw.shuffle(items)
-    elif way == 2:
-        items = items * draw.choice([2, 20])
-    elif way == 3:
-        del items[draw.randrange(len(items)) :]
-    elif field.message_type is None and isinstance(items[0], int | float):
-        items[draw.randrange(len(items))] = draw.choice(
-            [-1, 2**31 - 1, 0, 99999] if isinstance(items[0], int) else [float("nan"), 3e38, -1.0]
-        )
-    kept = [copy.deepcopy(x) for x in items]
-    message.ClearField(field.name)
-    getattr(message, field.name).extend(kept)
-
-
-def _tree(held: Any, draw: random.Random) -> Any:
-    """Entries of nested dictionaries and lists removed, doubled, reordered or replaced by something odd."""
-    for _ in range(draw.choice([1, 1, 5])):
-        at = held
-        while isinstance(at, dict | list) and at:
-            key = draw.choice(list(at)) if isinstance(at, dict) else draw.randrange(len(at))
-            if draw.random() < 0.25 or not isinstance(at[key], dict | list):
-                way = draw.randrange(4)
-                if way == 0:
-                    del at[key]
-                elif way == 1 and isinstance(at, list):
-                    at[:] = draw.sample(at, len(at)) * draw.choice([1, 3])
-                else:
-                    at[key] = draw.choice(JUNK)
-                break
-            at = at[key]
-    return held
-
-
-class Bomb:
-    """What a malicious pickle asks to be called."""
-
-    def __init__(self, function: Any, *arguments: Any) -> None:
-        self.called = function, arguments
-
-    def __reduce__(self) -> Any:
-        return self.called
-
-
-def malicious(flag: Path) -> dict[str, bytes]:
-    """Pickles that run code, or grow without end; `flag` exists afterwards if one of them ran."""
-    import os
-
-    import numpy as np
-
-    deep: Any = ()
-    for _ in range(100_000):
-        deep = (deep,)
-    shared: list[Any] = [1.0] * 10
-    for _ in range(30):
-        shared = [shared] * 10
-    many = b"".join((b"\x80\x04", b"]" * 1_100_000, b"."))
-    nested = b"".join((b"\x80\x04}", b")" + b"\x85" * 200_000, b"Ns."))
-    return {
-        "system": pickle.dumps(Bomb(os.system, f"touch {flag}")),
-        "eval": pickle.dumps({"tracks": Bomb(eval, f"open({str(flag)!r}, 'w')")}),
-        "exec in protocol 0": pickle.dumps(Bomb(exec, f"open({str(flag)!r}, 'w')"), protocol=0),
-        "instance": b"\x80\x02" + f"(S'touch {flag}'\nios\nsystem\n.".encode(),
-        "object": b"\x80\x04\x95\x00\x00\x00\x00\x00\x00\x00\x00(cos\nsystem\n" + f"V{flag}\no.".encode(),
-        "new object": b"\x80\x04cos\nsystem\nVtouch\n\x85\x81.",
-        "attribute of a name": b"\x80\x04\x8c\x05numpy\x8c\x0bndarray.ctx\x93)R.",
-        "getattr": pickle.dumps(Bomb(getattr, np.ndarray, "tofile")),
-        "numpy load": pickle.dumps(Bomb(np.load, str(flag))),
-        "huge array": pickle.dumps(Bomb(np.zeros, (10**12,))),
-        "array that claims more than it has": pickle.dumps(np.zeros(4)).replace(b"K\x04\x85", b"J\xff\xff\xff\x7f\x85"),
-        "huge bytes": b"\x80\x04\x8e" + b"\xff" * 7 + b"\x00" + b"x.",
-        "huge text": b"\x80\x04\x8d" + b"\xff" * 6 + b"\x00\x00x.",
-        "huge memo": b"\x80\x04Nr\xff\xff\xff\x7f.",
-        "huge number": b"\x80\x02\x8b\xff\xff\xff\x7f\x01.",
-        "million lists": many,
-        "deep tuple as a key": nested,
-        "deep tuple": pickle.dumps(None)[:2] + b")" + b"\x85" * 200_000 + b".",
-        "shared lists": pickle.dumps({"tracks": {"1": {"type": "VEHICLE", "position": shared}}, "map_features": {}}),
-        "itself": b"\x80\x04}q\x00\x8c\x06tracksh\x00s\x8c\x0cmap_featuresh\x00s.",
-        "extension": b"\x80\x04\x82\x01.",
-        "persistent": b"\x80\x04Nq\x00Q.",
-    }
+    @property
+    def clean(self) -> bool:
+        """Whether every file gave scenes or a reader's own line."""
+        return set(self.outcomes) <= {"scenes", "error"}
 
 
 def outcome(file: Path) -> str:
     """What reading and converting comes to: scenes, or one line that names the file.
 
     Raises:
-        AssertionError: the error has several lines or does not name the file.
+        AssertionError: the error has several lines, is too long or does not name the file.
     """
     try:
         for recording in read.recordings(file):
             convert(recording, Options(lanes=64, points=16))
     except UsageError as error:
-        assert file.name in str(error) and "\n" not in str(error), f"{error!r} should be one line that names {file.name}"
-        return "error"
+        said = str(error)
+        short = len(said) < len(str(file)) + 400 and said.isprintable()
+        assert file.name in said and short, f"{said[:1000]!r} should be one line that names {file.name}"
+        return "unforeseen" if read.UNFORESEEN in said else "error"
     return "scenes"
 
 
-def bases(kind: str) -> list[bytes]:
-    """What is damaged: our own file, and up to two real ones."""
-    folder = {"womd_scenario": "womd_scenario", "womd_tf_example": "womd_tf_example", "gpudrive_json": "gpudrive_json"}.get(
-        kind, "scenarionet_*"
-    )
-    return [written(kind), *(f.read_bytes() for f in sorted(SHARED.glob(f"{folder}/*"), key=lambda f: f.stat().st_size)[:2])]
+@contextlib.contextmanager
+def limited() -> Iterator[None]:
+    """Bounds the time and the memory of what is done within."""
+
+    def late(*_: Any) -> None:
+        raise TooLongError(f"more than {LONGEST:g} s")
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    before = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, LONGEST)
+    resource.setrlimit(resource.RLIMIT_AS, ((in_use("VmSize") + MOST) * 2**20, hard))
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
-def _repickled(data: bytes, draw: random.Random) -> bytes:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # old pickles of numpy name modules that have moved
-        held = pickle.loads(data)  # our own file, or a real one that we trust
-    return pickle.dumps(_tree(held, draw), protocol=draw.choice([2, 3, 4, 5]))
+@functools.cache
+def ready() -> None:
+    """Converts something once, as the first conversion starts the threads of JAX."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "whole"
+        file.write_bytes(written("womd_scenario"))
+        assert outcome(file) == "scenes"
 
 
-def run(kind: str, count: int, seed: int, sources: list[bytes]) -> tuple[Counter[str], float]:
-    """Outcomes of many damaged copies, and the slowest in s.
+def in_use(what: str) -> int:
+    """MB of this process by a name of /proc/self/status; VmHWM is the most since `CLEAR` was last written to."""
+    return int(STATUS.read_text().split(f"{what}:")[1].split()[0]) // 1024
 
-    Raises:
-        Exception: whatever a loader raises beside `UsageError`; the offending file is kept and named.
-    """
-    draw, outcomes, slowest = random.Random(f"{kind}{seed}"), Counter[str](), 0.0
-    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for number in range(count):
-            file = Path(folder) / f"damaged{number}"
+
+def tried(file: Path, told: Told) -> None:
+    """Adds what becomes of a file."""
+    ready()
+    CLEAR.write_text("5")
+    before, start = in_use("VmHWM"), time.perf_counter()
+    try:
+        with limited(), warnings.catch_warnings():
+            warnings.simplefilter("error")
+            what = outcome(file)
+    except (Exception, TooLongError) as error:
+        what = type(error).__name__
+        traceback.print_exc()
+    took, grew = time.perf_counter() - start, in_use("VmHWM") - before
+    what = "too large" if grew > LARGEST else what
+    told.outcomes[what] += 1
+    told.slowest, told.largest = max(told.slowest, took), max(told.largest, grew)
+    if what not in ("scenes", "error"):
+        kept = Path(tempfile.gettempdir()) / f"fuzz_{file.name}"
+        kept.write_bytes(file.read_bytes())
+        told.kept.append(kept)
+
+
+def bases(kind: str, folder: Path = SHARED) -> list[Path]:
+    """The recordings of others that are damaged; none where they are not there."""
+    folders = {"scenarionet": "scenarionet_*", "gpudrive_json": "gpudrive_json"}
+    return sorted(folder.glob(f"{folders.get(kind, kind)}/*"))
+
+
+def run(kind: str, numbers: range, seed: int, sources: list[bytes]) -> Told:
+    """What becomes of damaged copies; each depends on kind, seed, number and sources alone."""
+    told = Told()
+    with tempfile.TemporaryDirectory() as folder:
+        for number in numbers:
+            draw = random.Random(f"{kind} {seed} {number}")
+            file = Path(folder) / f"{kind}_{seed}_{number}"
             file.write_bytes(mutated(kind, draw.choice(sources), draw))
-            start = time.perf_counter()
-            try:
-                outcomes[outcome(file)] += 1
-            except Exception:
-                kept = Path(tempfile.gettempdir()) / f"fuzz_{kind}_{seed}_{number}"
-                kept.write_bytes(file.read_bytes())
-                sys.stderr.write(f"{kind} {number}: kept as {kept}\n")
-                raise
-            slowest = max(slowest, time.perf_counter() - start)
+            tried(file, told)
             file.unlink()
-    return outcomes, slowest
+    return told
 
 
 def main() -> None:
@@ -248,13 +157,23 @@ def main() -> None:
         prog="python -m tests.fuzz_logs", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--count", type=int, default=1000, help="damaged copies of each format")
+    parser.add_argument("--first", type=int, default=0, help="number of the first")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kind", choices=FORMATS, nargs="*", default=FORMATS)
+    parser.add_argument("--data", type=Path, default=SHARED, help="folder of the recordings")
     options = parser.parse_args()
+    clean = True
     for kind in options.kind:
-        outcomes, slowest = run(kind, options.count, options.seed, bases(kind))
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        print(f"{kind}: {dict(outcomes)}, slowest {slowest:.2f} s, peak memory so far {peak:.0f} MB", flush=True)
+        real = bases(kind, options.data)
+        sources = [file.read_bytes() for file in real] or [written(kind)]
+        faulthandler.dump_traceback_later(LONGEST * options.count, exit=True)  # compiled code does not hear the alarm
+        told = run(kind, range(options.first, options.first + options.count), options.seed, sources)
+        clean &= told.clean
+        what = f"{len(real)} recordings of others" if real else "our own recording"
+        print(f"{kind}, of {what}: {dict(told.outcomes)}, slowest {told.slowest:.2f} s, largest {told.largest:.0f} MB", flush=True)
+        for kept in told.kept:
+            print(f"  kept: {kept}")
+    sys.exit(0 if clean else "some gave neither scenes nor one line of a reader")
 
 
 if __name__ == "__main__":

@@ -269,6 +269,17 @@ def test_a_road_user_that_overlaps_the_agent_at_first_does_not_count_as_its_coll
     assert not scene.features(Demonstration(episode, track, ()), track)["collision"]
 
 
+def test_boxes_that_overlap_at_first_are_masked_apart_from_bodies_that_touch():
+    """At 3.9 m ahead and 1.9 m aside boxes of 4 by 2 m meet at a corner; the round ends of their capsules do not."""
+    scene, log = made("intersection"), crowded([4.2])
+    log = dataclasses.replace(log, pose=log.pose.at[1, :, 1].set(1.9))
+    episode = scene.episode(log)
+    track = jax.tree.map(lambda x: x, coast(episode))
+    features = scene.features(Demonstration(episode, track, ()), track)
+    assert bool(episode.context.overlapped[0]) and not bool(episode.context.ghosts[0])
+    assert not features["overlap"] and not features["collision"]
+
+
 def as_numpy(log, **changes):
     return dataclasses.replace(jax.tree.map(np.array, log), **changes)
 
@@ -319,8 +330,47 @@ def test_an_agent_that_the_log_has_off_the_road_is_masked():
     off = dataclasses.replace(log, pose=log.pose.at[0, :, 1].set(-6.0))
     assert scene.episode(off).context.starts_off_road and not scene.episode(log).context.starts_off_road
 
+    still = coast(scene.episode(log))
+    features = [scene.features(Demonstration(scene.episode(one), still, ()), still) for one in (log, off)]
+    assert [bool(f["may_leave_road"]) for f in features] == [True, False]
+
 
 # Metrics by hand
+
+
+def by_hand(**given):
+    """Features of a sample of four agents who did nothing, but for what is given."""
+    nothing = {name: np.zeros((1, 4)) for name in ("collision", "overlap", "offroad", "ade", "progress", "ran_red")}
+    nothing |= {"may_leave_road": np.ones((1, 4), bool), "curvature": np.zeros((1, 4, 3)), "branching": np.zeros((1, 4, 3), bool)}
+    return nothing | {name: np.array(x)[None] for name, x in given.items()}
+
+
+def test_who_starts_off_the_road_is_not_among_those_whose_time_off_it_counts():
+    held = by_hand(offroad=[0.5, 0.0, 1.0, 0.0], may_leave_road=[True, True, False, True])
+    assert made("intersection").metrics(held, held)["offroad_time"] == pytest.approx(0.5 / 3)
+
+
+def test_divergences_of_progress_and_of_curvature_where_lanes_branch():
+    """Half of the agents go where no expert goes: p = (1, 0), q = (1/2, 1/2), whose divergence is 0.311 bit; and none: 1 bit."""
+    there = by_hand(progress=[0.0, 10.0, 0.0, 10.0], curvature=[[0.0, 0.1, 9.0]] * 4, branching=[[True, True, False]] * 4)
+    near = by_hand(progress=[0.0, 0.0, 0.0, 0.0], curvature=[[0.1, 0.1, 0.0]] * 4, branching=[[True, True, False]] * 4)
+    expected = 0.5 * (np.log2(1 / 0.75) + 0.5 * np.log2(0.5 / 0.75) + 0.5 * np.log2(0.5 / 0.25))
+    found = made("intersection").metrics(near, there)
+    assert found["progress_jsd"] == pytest.approx(expected) and found["curvature_jsd"] == pytest.approx(expected)
+    assert made("intersection").metrics(by_hand(progress=[5.0] * 4), there)["progress_jsd"] == pytest.approx(1)
+
+
+def test_a_lane_branches_off_where_another_goes_on_from_the_same_lane():
+    """Also for who starts on it; curvature is a mean over neighbouring points, so that a corner of a line does not count for all."""
+    log = straight_road(count=2)
+    beyond = dataclasses.replace(log, pose=log.pose.at[0, :, 0].set(130.0))
+    routes = find_routes(beyond, beyond.pose[0, 0], RouteOptions())
+    assert routes.valid[0] and np.all(routes.branching[0, :20])
+    alone = straight_road(count=1)
+    assert not np.any(find_routes(alone, beyond.pose[0, 0], RouteOptions()).branching)
+    corner = find_routes(log, log.pose[0, 0], RouteOptions())
+    turn = np.arctan2(30.0, 100.0)
+    assert np.sum(corner.curvature[1]) * 2.0 == pytest.approx(turn, rel=0.01) and np.max(corner.curvature[1]) < 0.4 * turn / 2.0
 
 
 def played(scene, episode, positions):
@@ -376,6 +426,16 @@ def test_running_a_red_light_is_crossing_its_line_while_it_is_red():
         assert bool(ran_red(episode.context.routes, crossings(episode.context.routes, qpos))) is expected
         before = played(made("intersection"), episode, line(made("intersection"), [20.0, 0.0], [97.0, 0.0])).states.qpos
         assert not ran_red(episode.context.routes, crossings(episode.context.routes, before))
+
+
+def test_a_red_arrow_beside_a_green_light_stops_only_who_follows_it():
+    """Two ways share the path up to their stop lines: the car crosses both at once, and may, if one of them is open."""
+    log = straight_road(count=2)
+    for states, expected in (((RED, GREEN), False), ((GREEN, RED), False), ((RED, RED), True), ((RED, AMBER), False)):
+        signals = jnp.zeros((91, 3), int).at[:, 1:].set(jnp.array(states))
+        episode = made("intersection").episode(dataclasses.replace(log, signals=signals))
+        qpos = played(made("intersection"), episode, line(made("intersection"), [70.0, 0.0], [130.0, 0.0])).states.qpos
+        assert bool(ran_red(episode.context.routes, crossings(episode.context.routes, qpos))) is expected
 
 
 def test_flipped_signals_are_met_by_the_same_experts_with_the_same_minds(tmp_path, monkeypatch):

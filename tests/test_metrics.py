@@ -39,3 +39,12 @@ def test_bootstrap_interval_covers_the_mean_and_shrinks_with_size():
         assert low < 0.35 and high > -0.35
         widths.append(high - low)
     assert widths[0] == pytest.approx(2 * 1.96 / 10, rel=0.2) and widths[1] == pytest.approx(widths[0] / 10, rel=0.2)
+
+
+def test_bootstrap_interval_of_a_biased_statistic_is_around_its_value():
+    """Resampled divergences are all greater than the divergence itself."""
+    random = np.random.default_rng(2)
+    both = random.normal(size=(300, 2))
+    low, high = metrics.bootstrap(both, lambda held: metrics.jsd(held[:, 0], held[:, 1], bins=40, limits=(-3, 3)))
+    value = metrics.jsd(both[:, 0], both[:, 1], bins=40, limits=(-3, 3))
+    assert low < value < high

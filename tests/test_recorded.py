@@ -12,7 +12,7 @@ import recorded as files
 from jax import random
 from made import made, recordings
 
-from rtc_mjx import config, data, dataset, evaluate, inverse_dynamics, train
+from rtc_mjx import config, data, dataset, evaluate, inverse_dynamics, reference, train
 from rtc_mjx.challenge import at_log_rate
 from rtc_mjx.config import Config
 from rtc_mjx.errors import UsageError
@@ -288,32 +288,27 @@ def test_symphony_leaves_out_recordings_that_do_not_log_connectivity_and_says_ho
         _ = Recorded(data=str(mixed), only_connected=True).places
 
 
-def test_curvature_and_off_road_time_count_where_the_log_has_them(mixed):
-    """Two episodes, the second without road edges and connectivity: what it says of them does not count."""
-    scene = Recorded(data=str(mixed))
-    held = {name: np.zeros(2) for name in ("collision", "overlap", "ade", "progress", "ran_red")}
-    held |= {"offroad": np.array([0.5, 0.0]), "bounded": np.array([True, False])}
-    held |= {"curvature": np.array([[0.1, 0.2], [9.0, 9.0]]), "branching": np.array([[True, True], [False, False]])}
-    told = scene.metrics(held, held)
-    assert told["offroad_time"] == 0.5 and told["curvature_jsd"] == 0.0
+def test_curvature_is_left_out_only_where_no_recording_logs_connectivity(mixed):
+    held = {name: np.zeros((1, 2)) for name in ("collision", "overlap", "offroad", "may_leave_road", "ade", "progress", "ran_red")}
+    held |= {"curvature": np.array([[[0.1, 0.2], [9.0, 9.0]]]), "branching": np.array([[[True, True], [False, False]]])}
+    assert Recorded(data=str(mixed)).metrics(held, held)["curvature_jsd"] == 0.0
     (mixed / "shard").unlink()
     assert "curvature_jsd" not in Recorded(data=str(mixed)).metrics(held, held)
 
 
 @pytest.mark.usefixtures("quick_to_compile")
 def test_features_and_notes_say_what_a_recording_lacks(mixed):
-    """One file has edges and connectivity, the others have neither."""
+    """Those that do not log connectivity have no road edges either: they count for neither curvature nor off-road time."""
     for i in range(3):
         lacking = files.gpudrive() | {"scenario_id": f"g{i}"}
         lacking["roads"] = [road for road in lacking["roads"] if road["type"] != "road_edge"]
         (mixed / f"g{i}.json").write_text(json.dumps(lacking))
     scene = Recorded(data=str(mixed), steps=3, road_users=1)
     held = dataset.demonstrations(scene, 99, dataset.TRAIN)
-    names = scene.pool("train").names
-    lacks = np.array([name.startswith("g") for name in names])
-    told = evaluate.expert_features(scene, held)
+    lacks = np.array([name.startswith("g") for name in scene.pool("train").names])
+    told = reference.expert_features(scene, held)
     assert 0 < np.sum(lacks) < len(lacks)
-    assert told["bounded"].tolist() == (~lacks).tolist() and not np.any(told["branching"][lacks])
+    assert not np.any(told["may_leave_road"][lacks]) and not np.any(told["branching"][lacks])
     notes = scene.notes(held.episode)
     assert notes["test episodes without road edges (not in offroad_time)"] == np.sum(lacks)
     assert notes["test episodes whose lanes are not logged as connected (not in curvature_jsd)"] == np.sum(lacks)

@@ -363,6 +363,23 @@ def test_committed_settings_are_valid_for_every_method(scene):
         config.defaults(scene, method)
 
 
+def test_making_a_run_directory_that_was_stopped_can_be_done_again(tmp_path, monkeypatch):
+    """A directory with settings is whole: whoever finds them finds the recordings too."""
+    wanted = settings("bc", tmp_path / "run")
+    monkeypatch.setattr(type(wanted.scene), "recordings", lambda self: ["train a 1", "test b 2"])
+    with monkeypatch.context() as patched:
+        patched.setattr(config, "write", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            Run.create(wanted)
+    refused(["--run", str(tmp_path / "run"), "--resume"], "not a run directory")
+    monkeypatch.setattr(type(wanted.scene), "recordings", lambda self: ["train a 3", "test b 2"])
+    Run.create(wanted)
+    Run.open(tmp_path / "run").check_recordings()
+    (tmp_path / "other" / "checkpoints" / "4").mkdir(parents=True)
+    with pytest.raises(UsageError, match="exists.*--resume"):
+        Run.create(settings("bc", tmp_path / "other"))
+
+
 def test_an_existing_run_is_never_overwritten(whole):
     before = (whole.folder / "metrics.jsonl").read_bytes()
     with pytest.raises(UsageError, match="exists.*--resume"):

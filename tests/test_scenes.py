@@ -14,7 +14,7 @@ from dm_env import test_utils
 from jax import random
 from made import demonstrated, made
 
-from rtc_mjx import dataset
+from rtc_mjx import dataset, reference
 from rtc_mjx.environment import Environment
 from rtc_mjx.errors import NonFiniteError, UsageError
 from rtc_mjx.rollout import rollout
@@ -104,9 +104,24 @@ def test_rollout_matches_c_mujoco(scene, x64):
 
 def test_features_and_metrics_are_finite_and_the_expert_equals_itself(scene):
     _, features = demonstrated(scene.name)
+    features = {name: x[None] for name, x in features.items()}
     result = scene.metrics(features, features)
     assert all(np.isfinite(v) for v in result.values()) and set(scene.main_metrics) <= set(result)
     assert all(v == 0 for name, v in result.items() if "jsd" in name)
+
+
+def test_agents_are_compared_with_as_many_experts_as_they_have_rollouts(scene, tmp_path, monkeypatch):
+    """Where experts can drive an episode again; they are made once, and those of the floor are others."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    if not scene.redrivable:
+        return
+    theirs, floor = reference.experts(scene, 4), reference.more_experts(scene, 4)
+    assert all(x.shape[:2] == (scene.samples, 4) for held in (theirs, floor) for x in held.values())
+    name = scene.main_metrics[0] if scene.samples == 1 else "ade"
+    assert scene.samples == 1 or (np.all(theirs[name] > 0) and not np.array_equal(theirs[name], floor[name]))
+    monkeypatch.setattr(dataset, "demonstrate", None)  # would be called if it were made again
+    again = reference.experts(scene, 4)
+    assert all(np.array_equal(x, again[name]) for name, x in theirs.items())
 
 
 def test_what_is_seen_at_the_start_has_a_finite_derivative(scene):

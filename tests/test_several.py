@@ -9,7 +9,7 @@ import pytest
 from jax import random
 from test_driving import GENERATED, straight_road
 
-from rtc_mjx import config, dataset, evaluate, render
+from rtc_mjx import config, dataset, evaluate, reference, render
 from rtc_mjx.config import Config, Experts, Intervals
 from rtc_mjx.environment import Environment
 from rtc_mjx.errors import UsageError
@@ -184,7 +184,8 @@ def test_a_training_of_two_cars_goes_on_to_the_same_numbers_and_is_tested_and_fi
     test = jax.tree.map(lambda x: x[:4], data)
     features = evaluate.roller(learner, 3)(twice.networks, test, {}, random.key(0))
     assert features["prior"]["ade"].shape == (1, 3, 4, 2)
-    scores = evaluate.score(held, features, evaluate.expert_features(scene, test))["prior"]
+    theirs = {name: x[None] for name, x in reference.expert_features(scene, test).items()}
+    scores = evaluate.score(held, features, theirs)["prior"]
     assert 0 < scores["min_ade"][0] < np.mean(features["prior"]["ade"]) and 0 <= scores["collision_rate"][0] <= 1
     tracks = jax.tree.map(lambda x: np.asarray(x)[:1, None], expert.trajectory)
     first, *_, last = render.pictures(run, expert, tracks, "car0/top", (64, 64))
@@ -223,9 +224,10 @@ def test_several_experts_arrive_without_accident():
 def test_min_ade_is_each_agents_own_best_sample():
     scene = Intersection(controlled=2)
     expert = {name: np.zeros((2, 2)) for name in ("collision", "overlap", "offroad", "ade", "progress", "ran_red")}
-    expert |= {"curvature": np.zeros((2, 2, 3)), "branching": np.zeros((2, 2, 3), bool)}
+    expert |= {"curvature": np.zeros((2, 2, 3)), "branching": np.zeros((2, 2, 3), bool), "may_leave_road": np.ones((2, 2), bool)}
+    one = {name: x[None] for name, x in expert.items()}
     two = {name: np.stack([x, x]) for name, x in expert.items()} | {"ade": np.array([[[1.0, 4.0], [2.0, 3.0]], [[3.0, 2.0], [1.0, 5.0]]])}
-    assert scene.metrics(two, expert)["min_ade"] == pytest.approx((1 + 2 + 1 + 3) / 4) and scene.metrics(expert, expert)["min_ade"] == 0
+    assert scene.metrics(two, expert)["min_ade"] == pytest.approx((1 + 2 + 1 + 3) / 4) and scene.metrics(one, one)["min_ade"] == 0
 
 
 @pytest.mark.parametrize(

@@ -1,78 +1,158 @@
-"""The study: probes, claims and comparisons by hand, studies that are stopped and go on, the analysis of types end to end."""
+"""The study: verdicts and tests over seeds by hand, studies that are stopped and go on, results that are neither lost nor mixed up."""
 
 import functools
 import json
-from types import SimpleNamespace
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 from learning import SCENE
 
-from rtc_mjx import claims, dataset, evaluate, study, train, type_shift
-from rtc_mjx.errors import RunError, UsageError
+from rtc_mjx import (
+    charts,
+    claims,
+    config,
+    dataset,
+    entry,
+    evaluate,
+    over_seeds,
+    provenance,
+    report,
+    results,
+    study,
+    train,
+    type_shift,
+    verdicts,
+)
+from rtc_mjx.errors import DivergedError, UsageError
 from rtc_mjx.methods import METHODS
-from rtc_mjx.probe import ProbeOptions, information
+from rtc_mjx.runs import Run
 from rtc_mjx.scenes import SCENES
 
+ROOT = Path(__file__).resolve().parents[1]
 SMALL = [
     "--scene.steps", str(SCENE.steps), "--updates", "4", "--batch", "8", "--experts.train", "64", "--experts.test", "32",
     "--every.log", "2", "--every.test", "4", "--every.save", "2", "--model.width", "8", "--model.discriminator-width", "8",
 ]  # fmt: skip
-QUICK = ProbeOptions(updates=200, null=6)
 
 
-def test_a_probe_finds_the_bits_that_are_shared_and_none_where_there_are_none():
-    random = np.random.default_rng(0)
-    x = random.standard_normal((1024, 2))
-    noisy = 0.9 * x[:, :1] + np.sqrt(1 - 0.81) * random.standard_normal((1024, 1))
-    bits, null = information(x, noisy, QUICK)
-    assert 0.75 * 1.198 < bits < 1.05 * 1.198  # -log2(1 - 0.9^2) / 2
-    assert np.max(np.abs(null)) < 0.1
-    bit, _ = information(x, np.sign(x[:, :1]), QUICK)
-    assert 0.85 < bit < 1.02
-    nothing, null = information(x, random.standard_normal((1024, 3)), QUICK)
-    assert nothing < np.max(null) + 0.05
+def command(place, methods, *more, seeds=2):
+    return [
+        "--scene", "double_goal", "--methods", methods, "--seeds", str(seeds),
+        "--results", str(place), "--runs", str(place / "runs"), *SMALL, *more,
+    ]  # fmt: skip
 
 
-def run_with(tmp_path, name, **metrics):
-    """A stand-in for a run: an evaluation, and what the tables read of its settings."""
-    folder = tmp_path / name
-    folder.mkdir()
-    types = {source: {metric: {"per_seed": values} for metric, values in of.items()} for source, of in metrics.items()}
-    seeds = len(next(iter(metrics["prior"].values())))
-    result = {
-        "metrics": types["prior"],
-        "types": types,
-        "reference": {},
-        "update": 1,
-        "seeds": seeds,
-        "episodes": 4,
-        "asked": 4,
-        "commit": None,
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A study that was not stopped: its folder of results is double_goal, its runs are in runs/double_goal."""
+    place = tmp_path_factory.mktemp("whole")
+    study.main(command(place, "bc,mgail"))
+    return place
+
+
+@pytest.fixture
+def again(whole, tmp_path):
+    """A copy to go on with."""
+    return Path(shutil.copytree(whole, tmp_path / "again"))
+
+
+def record(method, seeds=4, first_seed=0, scene="double_goal", reference=None, **sources):
+    """A result with these metrics by source of types, as results/<scene>/<method>.json holds it."""
+    types = {
+        source: {metric: {"per_seed": values, "mean": float(np.mean(values))} for metric, values in of.items()}
+        for source, of in sources.items()
     }
-    (folder / "evaluation.json").write_text(json.dumps(result))
-    return SimpleNamespace(folder=folder, config=SimpleNamespace(scene=SimpleNamespace(main_metrics=("return",)), method=name))
+    table = config.to_dict(config.defaults(scene, method)) | {"seeds": seeds, "first_seed": first_seed}
+    return {
+        "scene": scene, "method": method, "metrics": types["prior"], "types": types, "reference": reference or {"expert": {}},
+        "update": 1, "seeds": seeds, "episodes": 4, "asked": 4, "commit": "abc", "measured_by": "x", "config": table, "study": "few",
+    }  # fmt: skip
 
 
-def test_claims_say_what_was_measured_and_whether_it_holds(tmp_path):
+# Numbers over seeds
+
+
+def test_interval_over_seeds_is_students():
+    low, high = over_seeds.interval([1.0, 2.0, 3.0])
+    assert (low, high) == pytest.approx((2 - 4.3027 / np.sqrt(3), 2 + 4.3027 / np.sqrt(3)), abs=1e-4)
+    assert over_seeds.interval([1.0]) is None
+    assert over_seeds.number([0.0, 0.0, 0.3]).startswith("0.1 [0, ")  # a rate is not below 0
+
+
+def test_sign_flip_counts_the_flips_that_are_as_far_out():
+    assert over_seeds.sign_flip(np.array([1.0, 2.0, 3.0])) == pytest.approx(2 / 8)
+    assert over_seeds.sign_flip(np.array([1.0, -1.0])) == pytest.approx(1.0)
+    fewest = next(n for n in range(2, 9) if over_seeds.sign_flip(np.arange(1.0, n + 1)) < 0.05)
+    assert fewest == over_seeds.DECIDING
+
+
+def test_holm_corrects_for_the_number_of_tests():
+    assert over_seeds.holm([0.01, 0.04, 0.03]) == pytest.approx([0.03, 0.06, 0.06])
+    assert over_seeds.holm([0.5, 0.9]) == pytest.approx([1.0, 1.0])
+
+
+def test_seeds_are_paired_by_their_number():
+    ours, theirs = results.seeds(record("rtc_c", first_seed=1, prior={}), [5.0, 6.0, 7.0]), {0: 100.0, 2: 1.0, 3: 2.0}
+    assert over_seeds.paired(ours, theirs).tolist() == [5.0, 5.0]  # seeds 2 and 3; not the first of one with the first of the other
+
+
+# Claims
+
+
+def test_verdicts_need_an_interval_and_enough_seeds():
+    def said(values):
+        return verdicts.verdict(dict(enumerate(values)))[0]
+
+    assert said([1.0, 1.1, 1.2]) == "too few seeds to tell (3)"
+    assert said([1.0, 1.1, 1.2, 0.9]) == "yes (4 seeds)"
+    assert said([-1.0, -1.1, -1.2, -0.9]) == "no (4 seeds)"
+    assert said([1.0, -1.1, 1.2, -0.9]) == "tie: within the noise (4 seeds)"
+    assert said([0.0] * 6) == "tie: within the noise (6 seeds)"
+    assert said([1.0, 1.1, 1.2, 0.9, 1.3, 0.8]) == "yes (6 seeds)"
+
+
+def analysed(held, bits, null):
+    return held | {"type_shift": {"information": {"xi": {"bits": bits, "null_95": null}}}}
+
+
+def test_claims_say_what_was_measured_and_whether_it_holds():
     held = {
-        "bc": {"prior": {"return": [20.0, 20.0, 20.0], "jsd_goal": [0.0] * 3}},
-        "mgail": {"prior": {"return": [30.0, 31.0, 32.0], "jsd_goal": [0.1] * 3}},
-        "rtc_c": {
-            "prior": {"return": [29.0, 31.0, 30.0], "jsd_goal": [0.001] * 3},
-            "paired": {"return": [40.0] * 3, "jsd_goal": [0.0] * 3},
-        },
-    }
-    runs = {name: run_with(tmp_path, name, **types) for name, types in held.items()}
-    rows = {line.split("|")[1].strip(): line for line in claims.claims("double_goal", runs).splitlines()[2:]}
-    assert len(rows) == 4  # not those of methods that were not run, nor of another scene
-    assert rows["MGAIL reaches a higher return than BC"].endswith("| yes |")
-    assert "30 >= 1 x 31" in rows["RTC returns at least what MGAIL does"]
-    assert rows["RTC returns at least what MGAIL does"].endswith("| no, within the noise |")
-    assert next(line for claim, line in rows.items() if "quarter" in claim).endswith("| yes |")
-    assert next(line for claim, line in rows.items() if "90 %" in claim).endswith("| no |")
-    assert claims.claims("roundabout", runs) == ""
+        "bc": record("bc", prior={"return": [20.0, 20.5, 19.5, 20.0], "jsd_goal": [0.0] * 4}),
+        "mgail": record("mgail", prior={"return": [30.0, 31.0, 32.0, 31.0], "jsd_goal": [0.1] * 4}),
+        "rtc_c": analysed(
+            record(
+                "rtc_c", prior={"return": [29.0, 31.0, 33.0, 31.5], "jsd_goal": [0.001, 0.002, 0.001, 0.0]},
+                paired={"return": [34.0, 34.1, 34.2, 34.0]}, shuffled={"return": [33.0, 33.1, 33.2, 33.0]},
+            ), [0.5, 0.5, 0.6, 0.4], 0.01,
+        ),
+        "naive_hierarchy_c": analysed(
+            record(
+                "naive_hierarchy_c", prior={"return": [10.0, 11.0, 9.0, 10.0]},
+                paired={"return": [33.0, 33.1, 33.2, 33.0]}, shuffled={"return": [13.0, 13.1, 13.2, 13.0]},
+            ), [4.0, 4.1, 4.2, 4.0], 0.01,
+        ),
+    }  # fmt: skip
+    rows = {line.split(" | ")[0].strip("| "): line.split(" | ") for line in claims.table("double_goal", held).splitlines()}
+    verdict = {claim: cells[5] for claim, cells in rows.items() if len(cells) == 7}
+    c = "(continuous types)"
+    assert verdict["MGAIL returns more than BC"] == "yes (4 seeds)"
+    assert verdict[f"RTC returns at least what MGAIL does {c}"] == "tie: within the noise (4 seeds)"
+    assert verdict[f"RTC reaches the goals as often as experts do {c}"] == "yes (4 seeds)"
+    assert verdict[f"RTC removes most of the conditional shift (paired less shuffled return) {c}"] == "yes (4 seeds)"  # 20 against 5 x 1
+    assert verdict[f"RTC's types hold no luck {c}"] == "tie: within the noise (4 seeds)"  # 0.5 against 0.01 + 0.41
+    assert rows[f"RTC returns at least what MGAIL does {c}"][6].startswith("MGAIL gathers more")
+    assert not rows[f"RTC reaches the goals as often as experts do {c}"][6].strip("| ")
+    assert "info_mgail_c was not run" in rows[f"RTC returns at least what InfoMGAIL does {c}"][3]
+    assert "31.12" in rows[f"RTC returns at least what MGAIL does {c}"][3] and "section V-A" in rows["MGAIL returns more than BC"][1]
+    assert claims.table("roundabout", held) == ""
 
 
 @functools.cache
@@ -88,78 +168,296 @@ def metrics_of(name):
     return set(scene.metrics({k: x[None] for k, x in features.items()}, features))
 
 
-def test_every_claim_names_metrics_that_its_scene_has():
-    for claim in claims.CLAIMS:
-        assert claim.scene in SCENES and claim.relation in ("<=", ">=")
-        for method, source, metric in (claim.left, claim.right):
-            assert method in METHODS and source in ("prior", "paired", "shuffled") and metric in metrics_of(claim.scene)
-
-
-def test_seeds_are_compared_in_pairs(tmp_path):
-    assert claims.sign_flip(np.array([1.0, 2.0, 3.0])) == pytest.approx(2 / 8)
-    assert claims.sign_flip(np.array([1.0, -1.0])) == pytest.approx(1.0)
-    runs = {
-        "mgail": run_with(tmp_path, "mgail", prior={"return": [1.0, 2.0, 3.0]}),
-        "rtc_c": run_with(tmp_path, "rtc_c", prior={"return": [2.0, 4.0, 6.0]}),
+@pytest.mark.parametrize("scene", ["double_goal", "intersection"])
+def test_every_claim_is_a_margin_a_seed_of_metrics_that_its_scene_has(scene):
+    about = [claim for claim in claims.CLAIMS if scene in claim.scenes]
+    of = {metric: [1.0, 2.0] for metric in metrics_of(scene)}
+    names = set().union(*(claim.left.names | claim.right.names for claim in about))
+    held = {
+        name: analysed(record(name.partition(",")[0], 2, scene=scene, prior=of, paired=of, shuffled=of), [1.0, 2.0], 0.0) for name in names
     }
-    text = claims.comparisons(runs)
-    assert "| rtc_c | return | +2 | [+1, +3] | 0.25 |" in text and "| mgail | return" not in text
-    assert claims.comparisons({"rtc_c": runs["rtc_c"]}) == ""
+    assert {name.partition(",")[0] for name in names} <= set(METHODS) and about
+    assert all(set(claim.margin(held)) == {0, 1} and claim.relation in ("<=", ">=") for claim in about)
 
 
-def test_a_study_that_was_stopped_ends_like_one_that_was_not(tmp_path, monkeypatch):
-    def begin(place, methods):
-        study.main([
-            "--scene", "double_goal", "--methods", methods, "--seeds", "2",
-            "--results", str(tmp_path / place), "--runs", str(tmp_path / place / "runs"), *SMALL,
-        ])  # fmt: skip
-
-    begin("whole", "bc,mgail")
-    with monkeypatch.context() as patched:
-        patched.setattr(evaluate, "main", lambda argv: (_ for _ in ()).throw(KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            begin("stopped", "bc,mgail")  # after the training of bc, before its evaluation
-    (tmp_path / "stopped" / "runs" / "double_goal" / "mgail").mkdir()  # stopped before its settings were written
-    begin("stopped", "bc,mgail")
-    for name in ("bc.json", "mgail.json"):
-        whole, stopped = (json.loads((tmp_path / p / "double_goal" / name).read_text()) for p in ("whole", "stopped"))
-        assert whole["metrics"] == stopped["metrics"] and whole["types"] == stopped["types"]
-    assert (tmp_path / "whole/double_goal/table.md").read_text() == (tmp_path / "stopped/double_goal/table.md").read_text()
-    assert (tmp_path / "whole/double_goal/curves.png").is_file()
-    assert (tmp_path / "whole/double_goal/overview.png").is_file()
-    monkeypatch.setattr(train, "train", lambda *_: pytest.fail("what is finished was trained again"))
-    monkeypatch.setattr(evaluate, "main", lambda argv: pytest.fail("what is finished was evaluated again"))
-    begin("whole", "bc,mgail")
-    with pytest.raises(UsageError, match=r"--seeds 3.*has 2"):
-        study.main(["--scene", "double_goal", "--methods", "bc", "--seeds", "3", "--results", str(tmp_path / "whole"),
-                    "--runs", str(tmp_path / "whole/runs"), *SMALL])  # fmt: skip
+# Tables
 
 
-def test_one_training_that_diverges_does_not_stop_the_others(tmp_path, monkeypatch):
+def test_methods_are_compared_with_their_counterparts_and_corrected():
+    values = {"return": [1.0, 2.0, 3.0, 5.0]}
+    held = {
+        name: record(name, prior={"return": [x + i for x in values["return"]]})
+        for i, name in enumerate(("mgail", "symphony", "naive_hierarchy_c", "rtc_c", "rtc_d"))
+    }
+    lines = report.TABLES["comparisons"](held, "double_goal").splitlines()
+    pairs = [tuple(line.split(" | ")[i].strip("| ") for i in (0, 1)) for line in lines if line.startswith("| ") and "---" not in line][1:]
+    assert ("rtc_c", "naive_hierarchy_c") in pairs and ("rtc_c", "symphony") in pairs and ("rtc_c", "mgail") in pairs
+    assert ("rtc_d", "naive_hierarchy_c") not in pairs and ("mgail", "mgail") not in pairs
+    assert "| rtc_c | mgail | return | 4 | +3 [+3, +3] | 0.125 | 1 |" in lines
+
+
+def test_tables_name_what_differs_from_the_committed_settings_and_other_commits():
+    held = {"mgail": record("mgail", prior={"return": [1.0] * 4}), "rtc_c": record("rtc_c", first_seed=1, prior={"return": [1.0] * 4})}
+    held["rtc_c"] |= {"commit": "def", "measured_by": "y"}
+    text = report.TABLES["table"](held, "few")
+    assert "`python -m rtc_mjx.study --scene double_goal --methods mgail --seeds 4 --name few --results results`" in text
+    assert "--methods rtc_c --seeds 4 --name few --first-seed 1 --results results" in text
+    assert "abc (mgail); def (rtc_c)" in text and "measured by different code" in text
+    del held["rtc_c"]["study"]  # of a run that `train` made
+    assert "`python -m rtc_mjx.train --scene double_goal --method rtc_c --seeds 4 --first-seed 1`" in report.TABLES["table"](held, "few")
+
+
+def test_options_of_a_result_give_its_settings_again():
+    argv = ["--scene", "double_goal", "--method", "rtc_d", "--losses.type-kl", "0.003", "--no-choice"]
+    argv = [*argv[:-1], "--model.no-choice-gradient", "--scene.steps", "20", "--first-seed", "3", "--seeds", "2"]
+    wanted = config.to_dict(config.from_command_line(argv, "test"))
+    options = results.options(wanted)
+    again = config.from_command_line(["--scene", "double_goal", "--method", "rtc_d", "--seeds", "2", *options], "test")
+    assert config.to_dict(again) == wanted and "--losses.type-kl" in options and "--batch" not in options
+
+
+def test_labels_are_moved_apart_and_no_further():
+    assert charts.apart([0.1, 0.5], 0.1) == pytest.approx([0.1, 0.5])
+    assert charts.apart([0.5, 0.5, 0.5], 0.1) == pytest.approx([0.4, 0.5, 0.6])
+    assert charts.apart([0.99, 0.99], 0.1) == pytest.approx([0.9, 1.0])  # not above the axes
+    moved = charts.apart([0.1, 0.12, 0.21, 0.9], 0.1)
+    assert np.all(np.diff(moved) > 0.0999) and np.mean(moved[:3]) == pytest.approx(np.mean([0.1, 0.12, 0.21]))
+
+
+def shift_of(seeds=4):
+    of = {"return": [30.0] * seeds}
+    return {
+        "update": 4, "types": {"paired": of, "same_xi": of, "shuffled": {"return": [12.0] * seeds}, "prior": {"return": [11.0] * seeds}},
+        "information": {"xi": {"bits": [2.0] * seeds, "null_95": 0.01}},
+        "realism": {"episodes": 8, "experts": 4, "features": {"return": {"agent": [0.3] * seeds, "floor": 0.05}}},
+    }  # fmt: skip
+
+
+def test_what_types_carry_and_conditional_realism_have_a_row_for_every_method():
+    held = {
+        "bc": record("bc", prior={"return": [1.0] * 4}) | {"type_shift": {"realism": shift_of()["realism"]}},
+        "mgail": record("mgail", prior={"return": [1.0] * 4}) | {"type_shift": {}},  # as of recordings
+        "rtc_c": record("rtc_c", prior={"return": [1.0] * 4}) | {"type_shift": shift_of()},
+    }
+    shift, realism = (report.TABLES[name](held, "double_goal").splitlines() for name in ("type_shift", "conditional_realism"))
+    assert sum(line.startswith("| rtc_c") for line in shift) == 1 and "| -18 [-18, -18] | -1 [-1, -1] | 2 ± 0 [2, 2] | 0.01 |" in shift[2]
+    assert not any(line.startswith("| bc") for line in shift)
+    assert [line.split(" | ")[2].strip(" |") for line in realism if line.startswith(("| bc", "| rtc_c"))] == ["0.05", "0.05"]
+
+
+# Studies
+
+
+def numbers(place):
+    """All that a study found, without when and where it did."""
+    out = {}
+    for file in sorted((place / "double_goal").glob("*.json")):
+        held = json.loads(file.read_text())
+        out[file.name] = {key: held[key] for key in held if key != "versions"}
+    return out | {file.name: file.read_text() for file in sorted((place / "double_goal").glob("*.md"))}
+
+
+def test_a_study_tells_all_that_it_found(whole):
+    out = whole / "double_goal"
+    made = {file.name for file in out.iterdir()}
+    assert {"table.md", "comparisons.md", "claims.md", "conditional_realism.md", "curves.png", "overview.png"} <= made
+    assert (whole / "claims.md").read_text().count("MGAIL returns more than BC") == 1
+    text = (out / "conditional_realism.md").read_text()
+    assert "| bc |" in text and "| mgail |" in text and "floor" in text
+    held = json.loads((out / "bc.json").read_text())
+    assert held["curves"]["return"]["updates"] == [4] and held["type_shift"]["realism"]["experts"] == entry.EXPERTS
+    text = (out / "table.md").read_text()
+    assert "python -m rtc_mjx.study --scene double_goal --methods bc,mgail --seeds 2 --scene.steps 16 --updates 4" in text
+
+
+STOPS = [
+    (config, "write"),  # a run directory without its settings
+    (Run, "save"),  # between a line of metrics and its checkpoint
+    (evaluate, "main"),
+    (type_shift, "main"),
+    (results, "write"),
+    (report, "rebuild"),
+]
+
+
+def test_a_study_that_was_stopped_anywhere_ends_like_one_that_was_not(whole, tmp_path, monkeypatch):
+    for module, name in STOPS:
+        with monkeypatch.context() as patched:
+            patched.setattr(module, name, lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+            with pytest.raises(KeyboardInterrupt):
+                study.main(command(tmp_path, "bc,mgail"))
+    (tmp_path / "runs" / "double_goal" / "mgail").mkdir()  # stopped before anything was written
+    study.main(command(tmp_path, "bc,mgail"))
+    assert numbers(tmp_path) == numbers(whole)
+
+
+def test_a_killed_study_ends_like_one_that_was_not(whole, tmp_path):
+    """SIGKILL after the first result is written, while the second training begins."""
+    argv = [sys.executable, "-m", "rtc_mjx.study", *command(tmp_path, "bc,mgail")]
+    with subprocess.Popen(argv, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as child:
+        deadline = time.monotonic() + 200
+        while not (tmp_path / "double_goal" / "table.md").is_file() and child.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.05)
+        child.send_signal(signal.SIGKILL)
+    assert not (tmp_path / "double_goal" / "mgail.json").is_file()
+    study.main(command(tmp_path, "bc,mgail"))
+    assert numbers(tmp_path) == numbers(whole)
+
+
+def test_what_is_finished_is_not_done_again(again, monkeypatch):
+    for module in (train, evaluate, type_shift):
+        monkeypatch.setattr(module, "train" if module is train else "main", lambda *_: pytest.fail("done again"))
+    study.main(command(again, "bc,mgail"))
+
+
+def test_results_of_another_command_stay_and_those_there_are_shown_before_anything_is_trained(again, whole, monkeypatch):
+    before = (again / "double_goal" / "table.md").read_text()
+    for file in (again / "double_goal").iterdir():
+        file.unlink()  # as after a clean checkout; the runs are there
+    monkeypatch.setattr(study, "complete", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        study.main(command(again, "rtc_c"))
+    assert (again / "double_goal" / "table.md").read_text() == before
+    assert {"bc.json", "mgail.json"} <= {file.name for file in (again / "double_goal").iterdir()}
+    shutil.rmtree(again / "runs")  # and where the runs are gone, the results are not
+    with pytest.raises(KeyboardInterrupt):
+        study.main(command(again, "rtc_c"))
+    assert (again / "double_goal" / "table.md").read_text() == before
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (["--losses.cloning", "2.0"], r"--losses\.cloning 2\.0 is wanted.*has 1\.0"),
+        (["--first-seed", "5"], "--first-seed 5 is wanted.*has 0"),
+        (["--updates", "8"], "--updates 8 is wanted.*has 4"),
+    ],
+)
+def test_a_finished_run_of_other_settings_is_not_taken_for_the_one_wanted(again, options, named, monkeypatch):
+    monkeypatch.setattr(study, "complete", lambda *_: pytest.fail("that is known before anything is trained"))
+    with pytest.raises(UsageError, match=named) as caught:
+        study.main(command(again, "rtc_c,mgail", *options))
+    assert "\n" not in str(caught.value)
+
+
+def test_committed_settings_that_changed_are_seen_too(again, monkeypatch):
+    """Going on with a run takes its own settings; the study asks for those of today."""
+    (again / "configs").mkdir()
+    (again / "configs" / "double_goal.toml").write_text("[losses]\ncloning = 0.5\n")
+    monkeypatch.setattr(config, "configs", lambda: again / "configs")
+    with pytest.raises(UsageError, match=r"(wanted|is wanted).*has"):
+        study.main(command(again, "bc"))
+
+
+def test_what_other_code_measured_is_measured_again(again, monkeypatch):
+    done = []
+    monkeypatch.setattr(evaluate, "main", lambda argv: done.append("evaluated") or restamp(again, "evaluation.json"))
+    monkeypatch.setattr(type_shift, "main", lambda argv: done.append("analysed") or restamp(again, "type_shift.json"))
+    monkeypatch.setattr(provenance, "measured_by", lambda: "newer")
+    study.main(command(again, "bc"))
+    assert done == ["evaluated", "analysed"]
+    study.main(command(again, "bc"))
+    assert len(done) == 2
+
+
+def restamp(place, name, **changes):
+    file = place / "runs" / "double_goal" / "bc" / name
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"measured_by": provenance.measured_by(), **changes}))
+
+
+def test_fewer_episodes_looked_at_by_hand_do_not_count(again):
+    run = Run.open(again / "runs" / "double_goal" / "bc")
+    assert entry.evaluated(run) and entry.shift_found(run, 32)
+    restamp(again, "evaluation.json", asked=8)
+    restamp(again, "type_shift.json", episodes=16)
+    assert not entry.evaluated(run) and not entry.evaluated(run, now=False) and not entry.shift_found(run, 32)
+
+
+def test_a_last_checkpoint_that_cannot_be_read_is_trained_again(again, whole):
+    """Its name alone says nothing: a result of an earlier update would stand in the table as that of the last."""
+    folder = again / "runs" / "double_goal" / "bc"
+    for part in (folder / "checkpoints" / "4" / "state").rglob("*"):
+        if part.is_file():
+            part.write_bytes(part.read_bytes()[: part.stat().st_size // 2])
+    (folder / "evaluation.json").unlink()
+    study.main(command(again, "bc,mgail"))
+    assert numbers(again) == numbers(whole)
+    assert any("unreadable" in p.name for p in (folder / "checkpoints").iterdir())  # nothing is thrown away
+
+
+def test_a_training_that_diverges_has_a_row_and_does_not_stop_the_others(again, monkeypatch):
     really = study.complete
 
-    def complete(entry, scene, folder, team):
-        if entry.name == "bc":
-            raise RunError("update 2: reconstruction of seed 0 is not finite")
-        return really(entry, scene, folder, team)
+    def complete(of, scene, folder, team):
+        if of.name == "bc":
+            raise DivergedError("update 2: cloning of seed 0 is not finite")
+        return really(of, scene, folder, team)
 
-    monkeypatch.setattr(study, "complete", complete)
-    out = tmp_path / "few"
-    out.mkdir()
-    (out / "claims.md").write_text("of other runs")
-    with pytest.raises(RunError, match="bc failed: update 2"):
-        study.main(["--scene", "double_goal", "--name", "few", "--methods", "bc,mgail", "--seeds", "1",
-                    "--results", str(tmp_path), "--runs", str(tmp_path / "r"), *SMALL])  # fmt: skip
-    assert (out / "mgail.json").is_file() and not (out / "bc.json").is_file() and not (out / "claims.md").is_file()
-    run = study.Run.open(tmp_path / "r" / "few" / "mgail")
-    assert study._evaluated(run)
-    evaluate.main(["--run", str(run.folder), "--episodes", "8"])  # somebody looks at fewer episodes: not the study's evaluation
-    assert not study._evaluated(run)
+    with monkeypatch.context() as patched:
+        patched.setattr(study, "complete", complete)
+        with pytest.raises(study.RunError, match="bc failed: update 2"):
+            study.main(command(again, "bc,mgail"))
+    out = again / "double_goal"
+    assert "| bc | diverged: update 2: cloning of seed 0 is not finite |" in (out / "table.md").read_text()
+    assert "bc diverged" in (out / "claims.md").read_text() and (out / "bc.json").is_file()
+    study.main(command(again, "bc"))  # it went well this time
+    assert "diverged" not in (out / "table.md").read_text() and not (out / "bc.failed.json").exists()
+
+
+def test_tables_and_figures_are_made_again_from_the_json_files_alone(again, whole):
+    out = again / "double_goal"
+    shutil.rmtree(again / "runs")
+    for file in [*out.glob("*.md"), *out.glob("*.png"), again / "claims.md"]:
+        file.unlink()
+    report.main([str(out)])
+    assert numbers(again) == numbers(whole) and "MGAIL returns more than BC" in (again / "claims.md").read_text()
+    for name in ("curves.png", "overview.png", "conditional_realism.png"):
+        assert (out / name).read_bytes() == (whole / "double_goal" / name).read_bytes()
+    (out / "bc.json").write_text("{")
+    with pytest.raises(UsageError, match=r"bc\.json is damaged"):
+        report.main([str(out)])
+
+
+def test_committed_results_can_be_read(tmp_path):
+    """Results of earlier versions, too, become tables."""
+    for place in ("double_goal", "intersection"):
+        shutil.copytree(ROOT / "results" / place, tmp_path / place)
+    report.main([str(tmp_path)])
+    assert "| rtc_c | prior |" in (tmp_path / "intersection" / "table.md").read_text() and (tmp_path / "claims.md").is_file()
 
 
 def test_a_study_is_named_by_a_name(tmp_path):
     with pytest.raises(UsageError, match=r"--name a/b: a name"):
         study.main(["--scene", "double_goal", "--name", "a/b", "--results", str(tmp_path)])
+
+
+# Variations
+
+
+@pytest.mark.usefixtures("quick_to_compile")
+def test_variations_are_compared_with_what_they_vary(tmp_path, monkeypatch):
+    """End to end: `--ablations` trains the method and its variation, and tells them apart in a table and a figure."""
+    monkeypatch.setattr(study, "VARIATIONS", {"model.type-size": ("rtc_c", (2,))})
+    monkeypatch.setattr(type_shift, "main", lambda argv: (Path(argv[1]) / "type_shift.json").write_text(json.dumps(shift_of(2))))
+    study.main(command(tmp_path, "rtc_c", "--ablations"))
+    out = tmp_path / "double_goal"
+    text = (out / "ablations.md").read_text()
+    assert "| rtc_c | 2 |" in text and "| rtc_c,model.type-size=2 | 2 |" in text and "--ablations" in text
+    assert "type-size" not in (out / "table.md").read_text()
+    assert (out / "ablations.png").read_bytes().startswith(b"\x89PNG") and (out / "rtc_c,model.type-size=2.json").is_file()
+    assert "| rtc_c |" in (out / "type_shift.md").read_text()
+
+
+def test_the_naive_hierarchy_stands_at_an_encoder_share_of_one():
+    of = {"prior": {"return": [1.0] * 4}}
+    held = {
+        "rtc_c": record("rtc_c", **of),
+        "rtc_c,encoder-share=0.5": record("rtc_c", **of),
+        "naive_hierarchy_c": record("naive_hierarchy_c", **of),
+    }
+    assert [(value, name) for value, (name, _) in charts._values(held, "rtc_c", "encoder-share").items()] == [
+        ("0.375", "rtc_c"), ("0.5", "rtc_c,encoder-share=0.5"), ("1.0", "naive_hierarchy_c"),
+    ]  # fmt: skip
 
 
 def test_variations_start_from_the_options_given():
@@ -169,11 +467,12 @@ def test_variations_start_from_the_options_given():
 
 
 def test_variations_change_one_thing_each_and_are_settings_that_exist():
-    held = study.entries("double_goal", ["rtc_c"], True, [])
-    assert len({entry.name for entry in held}) == len(held) > 10
-    for entry in held:
-        study.config.from_command_line(["--scene", "double_goal", "--method", entry.method, *entry.options], "study")
-    assert all(len(entry.options) == 2 for entry in held[1:])
+    held = study.entries("double_goal", ["rtc_c", "rtc_d"], True, [])
+    assert len({of.name for of in held}) == len(held) > 10 and any("rtc_d,model.type-count" in of.name for of in held)
+    for of in held:
+        settings = entry.resolved(of, "double_goal")
+        differs = results.options(config.to_dict(settings))
+        assert differs == list(of.options) and len(differs) == (2 if "," in of.name else 0)
 
 
 def test_a_folder_in_the_way_is_left_alone(tmp_path):
@@ -183,35 +482,3 @@ def test_a_folder_in_the_way_is_left_alone(tmp_path):
     with pytest.raises(UsageError, match="in the way"):
         study.complete(study.Entry("bc", "bc"), "double_goal", place)
     assert (place / "thesis.txt").is_file()
-
-
-def test_conditional_realism_by_hand():
-    """Two episodes, two experts and as many again for the floor; the second of two agents does what no expert does in one episode."""
-    theirs = np.array([[1.0, 1.0, 1.0, 1.0], [0.0, 1.0, 1.0, 0.0]])
-    ours = np.array([[[1.0, 0.0], [1.0, 1.0]], [[0.0, 0.0], [0.0, 1.0]]])  # (agents, rollouts, episodes)
-    assert type_shift.compared(ours, theirs) == {"agent": [0.0, 0.5], "floor": 0.0, "range": (0.0, 1.0)}
-    alike = type_shift.compared(np.zeros((1, 2, 2)), np.ones((2, 4)))  # experts who all do the same tell one who does not
-    assert alike == {"agent": [1.0], "floor": 0.0, "range": (0.0, 1.0)}
-    along = type_shift.compared(np.zeros((1, 2, 3, 5)), np.zeros((3, 4, 5)))  # a feature with a value at each of five times
-    assert along == {"agent": [0.0], "floor": 0.0, "range": (0.0, 1e-6)}
-
-
-@pytest.mark.parametrize("method", ["rtc_d", "bc"])
-def test_the_analysis_of_types_says_what_is_there_to_say(method, tmp_path):
-    folder = tmp_path / "run"
-    train.train(train.settings.from_command_line(["--scene", "double_goal", "--method", method, "--run", str(folder), *SMALL], "test"))
-    type_shift.main(["--run", str(folder), "--episodes", "32", "--experts", "4"])
-    result = json.loads((folder / "type_shift.json").read_text())
-    assert (folder / "media" / "type_shift.png").is_file()
-    assert all(len(of["agent"]) == 1 and 0 <= of["floor"] <= 1 for of in result["realism"]["features"].values())
-    assert set(result["realism"]["features"]) == set(SCENE.described_by)
-    if method == "bc":
-        assert "types" not in result
-        return
-    assert set(result["types"]) == {"prior", "paired", "same_xi", "shuffled"}
-    assert set(result["information"]) == {"xi", "mind"} and set(result["reencoding"]) == {"demonstration", "rollout", "rollout_elsewhere"}
-    parts = [of for of in result["by_luck"].values() if of["agents"]]
-    whole = sum(of["agents"] * of["return"][0] for of in parts) / 32
-    assert sum(of["agents"] for of in parts) == 32 and whole == pytest.approx(result["types"]["shuffled"]["return"][0])
-    with pytest.raises(UsageError, match="--episodes 8"):
-        type_shift.main(["--run", str(folder), "--episodes", "8"])

@@ -3,11 +3,15 @@
 A pickle is a program: it may import and call anything. This reads its operations (`pickletools`) and carries out those that build
 plain values; there is no import and no call among them. The names it may ask for stand in NAMES, each with a function of our own
 in its place. Whatever else it wants is refused by name.
+
+A pickle may name one value many times for two bytes each, so what is small in the file may be endless when it is written out. Nothing
+here copies or prints a value without counting: see `Machine.charge`, and `Plain` for the readers.
 """
 
 import io
 import pickletools
 import re
+import warnings
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -16,7 +20,12 @@ import numpy as np
 from rtc_mjx.errors import UsageError
 
 MOST_OPERATIONS = 1_000_000  # real scenes have one or two hundred thousand
-DTYPE = re.compile(r"[biuf][1248]|U\d{1,4}|S\d{1,4}|O8?")
+MOST_COPIES = 4  # of the whole file, that its arrays and byte strings may come to; real ones need two
+MOST_MEMO = 2**32  # more than that, numbers of a memo can be chosen so that a dictionary of them is slow
+MOST_KEY = 2**60  # likewise the whole numbers that are keys
+LAST_CODE_POINT = 0x10FFFF  # of Unicode; numpy does not check
+DTYPE = re.compile(r"[biuf][1248]|U[0-9]{1,4}|S[0-9]{1,4}|O8?")
+LONGEST = 200  # characters of a message; those of pickletools may quote the file
 MARK = object()
 Key = str | int | float | bool | None
 
@@ -25,12 +34,17 @@ class Refused(Exception):
     """What a pickle holds that no scene does."""
 
 
+def shown(value: Any) -> str:
+    """A value for a message: text as it is, of anything else its type, as nested lists may take for ever to print."""
+    return repr(value[:40]) if isinstance(value, str) else type(value).__name__
+
+
 class DType:
     """Stands for a numpy dtype while a pickle is read."""
 
     def __init__(self, code: Any, *_: Any) -> None:
         if not isinstance(code, str) or not DTYPE.fullmatch(code):
-            raise Refused(f"arrays of type {str(code)[:40]!r}")
+            raise Refused(f"arrays of type {shown(code)}")
         self.code, self.order = code, "<"
 
     def build(self, state: Any) -> None:
@@ -42,7 +56,7 @@ class DType:
     def array(self, shape: Any, fortran: Any, data: Any) -> np.ndarray:
         """The array of some bytes, or of a list of plain values; never larger than what was read."""
         if not isinstance(shape, tuple) or not all(isinstance(n, int) and 0 <= n < 2**32 for n in shape) or len(shape) > 4:
-            raise Refused(f"an array of shape {str(shape)[:40]}")
+            raise Refused(f"an array of a shape that is none ({shown(shape)})")
         order: Literal["F", "C"] = "F" if fortran else "C"
         if self.code.startswith("O"):
             if not isinstance(data, list):
@@ -55,6 +69,8 @@ class DType:
             if not isinstance(data, bytes | bytearray) or not dtype.itemsize:
                 raise Refused("an array whose numbers are no bytes")
             flat = np.frombuffer(data, dtype)
+            if self.code.startswith("U") and np.any(np.frombuffer(data, self.order + "u4") > LAST_CODE_POINT):
+                raise Refused("text of characters that do not exist")
         return flat.reshape(shape, order=order)
 
 
@@ -88,7 +104,7 @@ def _scalar(dtype: Any = None, data: Any = b"") -> Any:
 def _encode(text: Any = "", coding: Any = "latin1") -> bytes:
     """How pickles of protocol 2 hold bytes."""
     if not isinstance(text, str) or coding != "latin1":
-        raise Refused(f"an encoding {str(coding)[:40]!r}")
+        raise Refused(f"an encoding {shown(coding)}")
     return text.encode("latin1")
 
 
@@ -98,6 +114,10 @@ def _plain_dictionary(*_: Any) -> dict[Any, Any]:
 
 def _collection(*items: Any) -> list[Any]:
     return list(items[0]) if items and isinstance(items[0], list) else []
+
+
+def _is_key(value: Any) -> bool:
+    return isinstance(value, Key) and not (isinstance(value, int) and abs(value) > MOST_KEY)
 
 
 NAMES: dict[str, Callable[..., Any]] = {
@@ -113,11 +133,23 @@ CALLED = frozenset(NAMES) - {"numpy ndarray", "builtins int", "builtins float"} 
 
 
 class Machine:
-    """Stack and memo of a pickle; one method for each kind of operation."""
+    """Stack and memo of a pickle; one method for each kind of operation.
 
-    def __init__(self) -> None:
+    Args:
+        size: bytes of the file.
+    """
+
+    def __init__(self, size: int) -> None:
         self.stack: list[Any] = []
         self.memo: dict[int, Any] = {}
+        self.left = MOST_COPIES * size
+
+    def charge(self, arguments: Any) -> None:
+        """Counts what a function may copy of its arguments."""
+        held = arguments if isinstance(arguments, tuple) else ()
+        self.left -= sum(len(x) for x in held if isinstance(x, str | bytes | bytearray | list))
+        if self.left < 0:
+            raise Refused("the same values over and over")
 
     def since_mark(self) -> list[Any]:
         """Takes everything off the stack down to the mark."""
@@ -144,8 +176,8 @@ class Machine:
         if not isinstance(target, container):
             raise Refused("items of what is no container")
         if isinstance(target, dict):
-            if not all(isinstance(key, Key) for key in items[::2]) or len(items) % 2:
-                raise Refused("dictionary keys that are neither text nor numbers")
+            if not all(map(_is_key, items[::2])) or len(items) % 2:
+                raise Refused("dictionary keys that are neither text nor common numbers")
             target.update(zip(items[::2], items[1::2], strict=True))
         elif isinstance(target, list):
             target.extend(items)
@@ -156,6 +188,7 @@ class Machine:
         name = getattr(function, "name", None)
         if name not in CALLED or not isinstance(arguments, tuple):
             raise Refused(f"a call of {name or type(function).__name__}")
+        self.charge(arguments)
         self.stack.append(NAMES[name](*arguments))
 
     def build(self) -> None:
@@ -163,6 +196,7 @@ class Machine:
         target, state = self.take(2)
         if not isinstance(target, Array | DType):
             raise Refused(f"state of a {type(target).__name__}")
+        self.charge(state)
         target.build(state)
         self.stack.append(target)
 
@@ -171,13 +205,18 @@ class Name:
     """A name that a pickle asks for; only NAMES exist."""
 
     def __init__(self, module: Any, name: Any) -> None:
+        if not isinstance(module, str) or not isinstance(name, str):
+            raise Refused(f"a name made of {type(module).__name__} and {type(name).__name__}")
         self.name = f"{module} {name}"
         if self.name not in NAMES:
-            raise Refused(f"{str(module)[:40]}.{str(name)[:40]}")
+            raise Refused(f"{module[:40]}.{name[:40]}")
 
 
 def _memoized(machine: Machine, argument: Any) -> None:
-    machine.memo[len(machine.memo) if argument is None else argument] = machine.stack[-1]
+    place = len(machine.memo) if argument is None else argument
+    if not 0 <= place < MOST_MEMO:
+        raise Refused("a memo without bounds")
+    machine.memo[place] = machine.stack[-1]
 
 
 def _recalled(machine: Machine, argument: Any) -> None:
@@ -234,6 +273,15 @@ OPERATIONS: dict[str, Callable[[Machine, Any], None]] = {
 }  # fmt: skip
 
 
+def _carry_out(machine: Machine, data: bytes) -> None:
+    for count, (operation, argument, _) in enumerate(pickletools.genops(io.BytesIO(data))):
+        if operation.name not in OPERATIONS:
+            raise Refused(f"the operation {operation.name}")
+        if count > MOST_OPERATIONS:
+            raise Refused(f"more than {MOST_OPERATIONS} operations")
+        OPERATIONS[operation.name](machine, argument)
+
+
 def load(data: bytes, source: str) -> Any:
     """The value of a pickle; arrays in it are `Array`, sets are lists.
 
@@ -244,18 +292,15 @@ def load(data: bytes, source: str) -> Any:
     Raises:
         UsageError: it is cut off or damaged, or holds more than plain values and arrays.
     """
-    machine, operation = Machine(), None
+    machine = Machine(len(data))
     try:
-        for count, (operation, argument, _) in enumerate(pickletools.genops(io.BytesIO(data))):
-            if operation.name not in OPERATIONS:
-                raise Refused(f"the operation {operation.name}")
-            if count > MOST_OPERATIONS:
-                raise Refused(f"more than {MOST_OPERATIONS} operations")
-            OPERATIONS[operation.name](machine, argument)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # pickletools, of odd escapes in names that are refused anyway
+            _carry_out(machine, data)
     except Refused as why:
         raise UsageError(f"{source}: its pickle holds {why}, which no recorded scene needs; it was not carried out") from why
-    except (ValueError, IndexError, TypeError, OverflowError, MemoryError) as error:
-        cause = str(error).splitlines()[0] if str(error) else type(error).__name__
+    except (ValueError, IndexError, TypeError, OverflowError) as error:
+        cause = str(error).splitlines()[0][:LONGEST] if str(error) else type(error).__name__
         raise UsageError(f"{source}: its pickle is damaged: {cause}") from error
     if len(machine.stack) != 1:
         raise UsageError(f"{source}: its pickle is damaged: {len(machine.stack)} values are left on its stack")

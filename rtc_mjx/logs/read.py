@@ -1,8 +1,9 @@
 """Files, folders and globs -> a stream of recordings. What a file is, is told by its content, never by its name."""
 
+import contextlib
 import glob
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -14,6 +15,8 @@ from rtc_mjx.logs.recording import Kind, Recording, refuse_if
 KINDS: tuple[Kind, ...] = get_args(Kind)
 LARGEST = 64 * 2**20  # bytes of a file that is read at once (JSON, pickle); real ones have up to twenty million
 SHOWN = 64  # bytes of a file that tell what it is
+UNFORESEEN = "it is damaged in a way that no reader has foreseen"
+SHOWN_OF_CAUSE = 200  # characters
 RECORDS = {"womd_scenario": womd.read, "womd_tf_example": tf_example.read}  # kinds of records in a TFRecord
 WHOLE = {"gpudrive_json": gpudrive.read, "scenarionet": scenarionet.read}
 MAGIC = {
@@ -68,12 +71,27 @@ def kind_of(file: Path) -> Kind | Foreign:
     Raises:
         UsageError: it cannot be read, or is empty.
     """
+    with _reading(file):
+        return _kind_of(file)
+
+
+@contextlib.contextmanager
+def _reading(file: Path) -> Iterator[None]:
+    """One line where the disk or the permissions fail.
+
+    Raises:
+        UsageError: the file cannot be read.
+    """
     try:
-        refuse_if(not file.is_file(), str(file), "it is no file")
-        with file.open("rb") as opened:
-            start = opened.read(SHOWN)
+        yield
     except OSError as error:
-        raise UsageError(f"{file}: it cannot be read: {error.strerror}") from error
+        raise UsageError(f"{file}: it cannot be read: {error.strerror or error}") from error
+
+
+def _kind_of(file: Path) -> Kind | Foreign:
+    refuse_if(not file.is_file(), str(file), "it is no file")
+    with file.open("rb") as opened:
+        start = opened.read(SHOWN)
     refuse_if(not start, str(file), "the file is empty")
     if tfrecord.is_tfrecord(start):
         return _record_kind(file)
@@ -150,14 +168,31 @@ def recordings(file: Path, kind: Kind | None = None) -> Iterator[Recording]:
     if isinstance(found, Foreign):
         raise UsageError(f"{file}: a recording is expected ({', '.join(KINDS)}); this is {found.what}")
     refuse_if(kind is not None and kind != found, str(file), f"{kind} is expected; this is {found}")
-    try:
+    with _reading(file):
         if found in WHOLE:
-            yield WHOLE[found](_whole(file), str(file))
+            yield _made(WHOLE[found], _whole(file), str(file))
             return
         for number, payload in enumerate(tfrecord.records(file)):
-            yield RECORDS[found](payload, f"{file}, record {number}")
-    except OSError as error:
-        raise UsageError(f"{file}: it cannot be read: {error.strerror}") from error
+            yield _made(RECORDS[found], payload, f"{file}, record {number}")
+
+
+def _made(reader: Callable[[bytes, str], Recording], data: bytes, source: str) -> Recording:
+    """What a reader makes of a file or record.
+
+    The readers say what is wrong wherever they have thought of it. What they have not, still has to name the file and must not end a
+    conversion of thousands of files; the traceback stays below the error. `MemoryError` is passed on: it is the machine's and not
+    necessarily the file's, and to go on from there helps nobody.
+
+    Raises:
+        UsageError: the data are no recording.
+    """
+    try:
+        return reader(data, source)
+    except (UsageError, MemoryError):
+        raise
+    except Exception as error:
+        cause = (str(error).splitlines() or [""])[0][:SHOWN_OF_CAUSE]
+        raise UsageError(f"{source}: {UNFORESEEN} ({type(error).__name__}: {cause})") from error
 
 
 def stream(paths: Iterable[str | Path]) -> Iterator[Recording]:

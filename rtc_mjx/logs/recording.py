@@ -6,6 +6,7 @@ Lengths vary and nothing is left out, so that counts are those of the file. Metr
 text. Plain numpy.
 """
 
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -22,7 +23,10 @@ SIGNAL_STATES = (
 )  # fmt: skip
 MPH = 0.44704  # m/s
 MOST_CELLS = 1_000_000  # tracks x times; a file that claims more is no recording of traffic
-MOST_POINTS = 500_000  # of a map, and as many links between its lanes
+MOST_TRACKS = 10_000  # real scenes have some hundreds
+MOST_FEATURES = 100_000  # of a map
+MOST_POINTS = 500_000  # of a map
+MOST_LINKS = 50_000  # between its lanes; real maps have up to two thousand
 MOST_SIGNALS = 500_000  # states of traffic lights
 
 
@@ -184,10 +188,17 @@ def empty_tracks(ids: tuple[str, ...], times: int, source: str) -> Tracks:
     """
     count = len(ids)
     refuse_if(not count or not times, source, f"it has {count} tracks and {times} times; at least one of each is needed")
+    refuse_if(count > MOST_TRACKS, source, f"it claims {count} tracks; more than {MOST_TRACKS} are not read")
     refuse_if(count * times > MOST_CELLS, source, f"it claims {count} tracks at {times} times; more than {MOST_CELLS} states are not read")
     shape = (count, times)
     nothing = np.zeros(shape, bool)
     return Tracks(ids, np.zeros(count, int), np.zeros((*shape, 4)), np.zeros((*shape, 2)), np.full((*shape, 3), np.nan), nothing)
+
+
+def current(index: int, times: int, repairs: Counter[str]) -> int:
+    """The index of the current time, moved to the nearest there is where the file names one that is none."""
+    repairs["current times outside of the recording, moved to its nearest"] += not 0 <= index < times
+    return min(max(0, index), times - 1)
 
 
 def no_signals() -> Signals:

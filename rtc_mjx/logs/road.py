@@ -20,6 +20,7 @@ Connectivity = Literal["logged", "derived", "none"]
 MEETS, STRAIGHT, LEVEL = 0.1, np.radians(20.0), 1.0  # m, rad, m: how well a lane has to go on to be taken as connected
 TOLERANCE = 0.05  # m, by which a simplified line may be off
 AT_ONCE = 400  # points of a road edge
+MOST_WAYS = 1000  # on from a lane; real ones have up to ten
 MOST_LANES = 5000  # of a map; those of whole quarters have one or two thousand
 SHORTEST = 0.05  # m, below which a lane is none
 EVERYBODY = 2  # who goes first at a stop sign (`RoadGraph.gives_way`)
@@ -152,25 +153,25 @@ def _farthest(line: np.ndarray, first: int, last: int) -> tuple[float, int, int,
 
 def _logged(recording: Recording, index: dict[str, int]) -> tuple[tuple[int, ...], ...]:
     """Exits, and lanes that name this one as their entry; ways through a lane without a length go on behind it."""
-    exits: dict[str, list[str]] = {lane.id: list(lane.exits) for lane in recording.map.lanes}
+    known = {lane.id for lane in recording.map.lanes}
+    exits = {lane.id: {other: None for other in lane.exits if other in known} for lane in recording.map.lanes}  # in the file's order
     for lane in recording.map.lanes:
-        for entry in lane.entries:
-            if entry in exits and lane.id not in exits[entry]:
-                exits[entry].append(lane.id)
+        for entry in known.intersection(lane.entries):
+            exits[entry][lane.id] = None
     passed = {lane.id for lane in recording.map.lanes if lane.kind != "bike_lane"} - set(index)
-    return tuple(_beyond(name, exits, passed, index) for name in index)
+    return tuple(_beyond(name, exits, passed, index, recording.source) for name in index)
 
 
-def _beyond(name: str, exits: dict[str, list[str]], passed: set[str], index: dict[str, int]) -> tuple[int, ...]:
+def _beyond(name: str, exits: dict[str, dict[str, None]], passed: set[str], index: dict[str, int], source: str) -> tuple[int, ...]:
     found: dict[int, None] = {}
     waiting, seen = list(exits[name]), set()
-    while waiting:
-        other = waiting.pop(0)
+    for other in waiting:  # grows on the way
+        refuse_if(len(waiting) > MOST_WAYS, source, f"lane {name} leads on to more than {MOST_WAYS} lanes")
         if other in index:
             found[index[other]] = None
         elif other in passed and other not in seen:
             seen.add(other)
-            waiting += exits[other]
+            waiting.extend(exits[other])
     return tuple(found)
 
 

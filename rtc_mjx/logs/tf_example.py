@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 
 from rtc_mjx.logs import messages
+from rtc_mjx.logs.plain import text
 from rtc_mjx.logs.recording import (
     MOST_POINTS,
+    MOST_SIGNALS,
     OTHER,
     SIGNAL_STATES,
     Feature,
@@ -22,7 +24,7 @@ from rtc_mjx.logs.recording import (
     no_signals,
     refuse_if,
 )
-from rtc_mjx.logs.womd import parsed
+from rtc_mjx.logs.womd import MOST_ID, parsed
 
 PARTS = ("past", "current", "future")
 STATE = ("x", "y", "z", "bbox_yaw", "velocity_x", "velocity_y", "length", "width", "height")
@@ -75,7 +77,8 @@ class Arrays:
     def text(self, name: str) -> str:
         """The text of a feature; empty where it is missing."""
         held = self.values.get(name.encode())
-        return held.bytes_list.value[0].decode("utf-8", "replace") if held is not None and len(held.bytes_list.value) else ""
+        told = held.bytes_list.value[0] if held is not None and len(held.bytes_list.value) else b""
+        return text(told[:MOST_ID].decode("utf-8", "replace"))
 
 
 def read(payload: bytes, source: str) -> Recording:
@@ -164,5 +167,8 @@ def _signals(arrays: Arrays, lengths: tuple[int, ...], repairs: dict[str, int]) 
     held = {name: arrays.over_time(group, name, lengths, max(1, lights), True) for name in ("state", "id", "valid", "x", "y", "z")}
     there = (held["valid"] == 1) & (held["state"] >= 0) & (held["state"] < len(SIGNAL_STATES))
     time, light = np.nonzero(there.T)
+    refuse_if(
+        len(time) > MOST_SIGNALS, arrays.source, f"it claims {len(time)} states of traffic lights; more than {MOST_SIGNALS} are not read"
+    )
     stop = np.stack([held[name][light, time].astype(float) for name in ("x", "y", "z")], axis=-1)
     return Signals(time, tuple(f"{i:.0f}" for i in held["id"][light, time]), held["state"][light, time].astype(int), stop)

@@ -8,7 +8,10 @@ from google.protobuf.message import DecodeError
 
 from rtc_mjx.errors import UsageError
 from rtc_mjx.logs import messages
+from rtc_mjx.logs.plain import text
 from rtc_mjx.logs.recording import (
+    MOST_FEATURES,
+    MOST_LINKS,
     MOST_POINTS,
     MOST_SIGNALS,
     MPH,
@@ -22,10 +25,12 @@ from rtc_mjx.logs.recording import (
     Signals,
     StopSign,
     Tracks,
+    current,
     empty_tracks,
     refuse_if,
 )
 
+MOST_ID = 1000  # bytes of a scenario's id that are looked at; real ones have 16
 LANE_KINDS: tuple[LaneKind, ...] = ("unknown", "freeway", "surface_street", "bike_lane")
 
 
@@ -44,21 +49,22 @@ def read(payload: bytes, source: str) -> Recording:
     sdc, repairs = int(scenario.sdc_track_index), Counter[str]()
     tracks = _tracks(scenario.tracks, len(times), source, repairs)
     known = range(len(tracks.ids))
-    wanted = [int(p.track_index) for p in scenario.tracks_to_predict]
-    refuse_if(any(i not in known for i in wanted), source, f"tracks_to_predict names track {wanted}; there are {len(known)}")
+    wanted = tuple(dict.fromkeys(int(p.track_index) for p in scenario.tracks_to_predict))
+    unknown = [i for i in wanted if i not in known]
+    refuse_if(bool(unknown), source, f"tracks_to_predict names tracks {unknown[:5]}; there are {len(known)}")
     named = scenario.HasField("sdc_track_index")
     refuse_if(named and sdc not in known, source, f"sdc_track_index is {sdc}; there are {len(known)} tracks")
     return Recording(
-        scenario=scenario.scenario_id.decode("utf-8", "replace"),
+        scenario=text(scenario.scenario_id[:MOST_ID].decode("utf-8", "replace")),
         source=source,
         kind="womd_scenario",
         times=times,
-        now=int(scenario.current_time_index),
+        now=current(int(scenario.current_time_index), len(times), repairs),
         tracks=tracks,
         map=read_map(scenario.map_features, source, repairs),
         signals=_signals(scenario.dynamic_map_states, len(times), source, repairs),
         sdc=sdc if named else -1,
-        to_predict=tuple(wanted),
+        to_predict=wanted,
         of_interest=tuple(str(i) for i in scenario.objects_of_interest),
         repairs={what: count for what, count in repairs.items() if count},
     )
@@ -78,6 +84,8 @@ def parsed(message: Any, payload: bytes, source: str) -> Any:
 
 def _tracks(logged: Any, times: int, source: str, repairs: Counter[str]) -> Tracks:
     out = empty_tracks(tuple(str(t.id) for t in logged), times, source)
+    again = [known for known, count in Counter(out.ids).items() if count > 1]
+    refuse_if(bool(again), source, f"it has several tracks with the ids {again[:5]}; each road user has one of its own")
     for i, track in enumerate(logged):
         states = [
             (s.center_x, s.center_y, s.center_z, s.heading, s.velocity_x, s.velocity_y, s.length, s.width, s.height, s.valid)
@@ -94,10 +102,12 @@ def _tracks(logged: Any, times: int, source: str, repairs: Counter[str]) -> Trac
 def read_map(features: Any, source: str, repairs: Counter[str]) -> Map:
     """The map of a Scenario's features."""
     held: dict[str, list[Any]] = {name: [] for name in ("road_edge", "road_line", "crosswalk", "speed_bump", "driveway")}
-    lanes, signs, points = [], [], 0
+    lanes, signs, points, links = [], [], 0, 0
+    refuse_if(len(features) > MOST_FEATURES, source, f"its map has {len(features)} features; more than {MOST_FEATURES} are not read")
     for feature in features:
-        points += _count(feature)
-        refuse_if(points > MOST_POINTS, source, f"its map has more than {MOST_POINTS} points and links")
+        points, links = points + _points_of(feature), links + _links_of(feature)
+        refuse_if(points > MOST_POINTS, source, f"its map has more than {MOST_POINTS} points")
+        refuse_if(links > MOST_LINKS, source, f"its map has more than {MOST_LINKS} links between lanes")
         if feature.HasField("lane"):
             lanes.append(_lane(str(feature.id), feature.lane))
         elif feature.HasField("stop_sign"):
@@ -117,12 +127,16 @@ def read_map(features: Any, source: str, repairs: Counter[str]) -> Map:
     )  # fmt: skip
 
 
-def _count(feature: Any) -> int:
-    """Points and links of a map feature, before they are taken out of the message."""
-    lane = feature.lane
-    links = (lane.entry_lanes, lane.exit_lanes, lane.left_neighbors, lane.right_neighbors, feature.stop_sign.lane)
+def _points_of(feature: Any) -> int:
+    """How many points a map feature has, before they are taken out of the message."""
+    lines = (feature.lane.polyline, feature.road_line.polyline, feature.road_edge.polyline)
     areas = (feature.crosswalk.polygon, feature.speed_bump.polygon, feature.driveway.polygon)
-    return sum(map(len, (lane.polyline, feature.road_line.polyline, feature.road_edge.polyline, *links, *areas)))
+    return sum(map(len, (*lines, *areas)))
+
+
+def _links_of(feature: Any) -> int:
+    lane = feature.lane
+    return sum(map(len, (lane.entry_lanes, lane.exit_lanes, lane.left_neighbors, lane.right_neighbors, feature.stop_sign.lane)))
 
 
 def _lane(name: str, lane: Any) -> Lane:

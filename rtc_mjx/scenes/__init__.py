@@ -1,7 +1,7 @@
 """Scenes: what happens in a world. Adding one takes a file here, an MJCF file if the world is new, and a line in `SCENES`."""
 
 from rtc_mjx.errors import UsageError
-from rtc_mjx.scenes.base import Actor, ItemSet, Scene, split_items
+from rtc_mjx.scenes.base import Actor, Features, ItemSet, Scene, split_items
 from rtc_mjx.scenes.double_goal import DoubleGoal
 from rtc_mjx.scenes.intersection import Intersection
 from rtc_mjx.scenes.merge import Merge
@@ -30,6 +30,6 @@ def scene_type(name: str) -> type[Scene]:
 
 
 __all__ = [
-    "SCENES", "Actor", "DoubleGoal", "Intersection", "ItemSet", "Merge", "Recorded", "Roundabout", "Scene", "crew", "merged", "parted",
-    "scene_type", "split_items",
+    "SCENES", "Actor", "DoubleGoal", "Features", "Intersection", "ItemSet", "Merge", "Recorded", "Roundabout", "Scene", "crew", "merged",
+    "parted", "scene_type", "split_items",
 ]  # fmt: skip

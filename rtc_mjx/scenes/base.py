@@ -21,6 +21,8 @@ from rtc_mjx.physics import PhysicsState, World
 from rtc_mjx.pytree import pytree
 from rtc_mjx.trajectory import Demonstration, Episode, Trajectory
 
+Features = dict[str, np.ndarray]  # of a population of trajectories, by name, with leading axes as `Scene.metrics` says
+Ranges = dict[str, tuple[float, float]]
 Act = Callable[[Any, Array, Any], tuple[Any, Array]]  # (memory, observation, noise of one step) -> (memory, action)
 
 
@@ -170,7 +172,7 @@ class Scene(abc.ABC):
         """
         return None
 
-    def ranges(self, expert: dict[str, np.ndarray]) -> dict[str, list[float]]:
+    def ranges(self, expert: Features) -> Ranges:
         """Ranges of histograms that metrics take from the expert's features."""
         return {}
 
@@ -227,10 +229,11 @@ class Scene(abc.ABC):
         """The numbers of one trajectory that metrics compare between populations; `demonstration` is the expert's of the episode."""
 
     @abc.abstractmethod
-    def metrics(self, features: dict[str, np.ndarray], expert: dict[str, np.ndarray]) -> dict[str, float]:
+    def metrics(self, features: Features, expert: Features, ranges: Ranges | None = None) -> dict[str, float]:
         """The scene's metrics of one population of trajectories against the expert's.
 
         Args:
             features: of the population, with leading axes (samples, episodes), and agents where there are several.
-            expert: of the expert, with a leading axis of episodes, and agents.
+            expert: of experts in these episodes, as the population's.
+            ranges: of histograms; those of `expert` unless given.
         """

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from rtc_mjx import metrics
 from rtc_mjx.physics import PhysicsState, Surroundings, World, load, rest_state
-from rtc_mjx.scenes.base import Actor, Scene
+from rtc_mjx.scenes.base import Actor, Features, Ranges, Scene
 from rtc_mjx.trajectory import Demonstration, Episode, Trajectory
 
 GOAL_X = (-0.9, 0.9)  # m, goals are drawn in this range ...
@@ -136,7 +136,7 @@ class DoubleGoal(Scene):
             "decided": rewards[-1],
         }
 
-    def metrics(self, features: dict[str, np.ndarray], expert: dict[str, np.ndarray]) -> dict[str, float]:
+    def metrics(self, features: Features, expert: Features, ranges: Ranges | None = None) -> dict[str, float]:
         """Mean return in steps; Jensen-Shannon divergence in bits from the expert's of h, and of goal and turn together; share lower."""
         both, experts = (2 * f["upper"] + f["left"] for f in (features, expert))
         return {

@@ -29,7 +29,7 @@ from rtc_mjx.physics import PhysicsState, Surroundings, World, load, rest_state,
 from rtc_mjx.physics.car import CAR, CONTROL_UNIT
 from rtc_mjx.pytree import pytree
 from rtc_mjx.scenes import scenery
-from rtc_mjx.scenes.base import ItemSet, Scene
+from rtc_mjx.scenes.base import Features, ItemSet, Ranges, Scene
 from rtc_mjx.scenes.routes import SPACING, RouteOptions, Routes, find_routes
 from rtc_mjx.scenes.several import cars_apart, cars_together, the_others
 from rtc_mjx.scenes.sight import FAR, OFF_ROUTE, ROUTE, USER, Others, around_each, see_routes, see_users
@@ -58,12 +58,13 @@ class Road:
         yaw_rate: of the road users, rad/s.
         kind: of each, as in `logs`; 0 for none.
         present: when each is there.
-        ghosts: those that overlap the agent at t = 0, road users and then other agents: they do not count as its collisions.
+        ghosts: those that touch the agent at t = 0 by their capsules, road users and then other agents: not counted as its collisions.
+        overlapped: those whose boxes overlap its own at t = 0: not counted as its overlaps.
         starts_off_road: whether the log itself has the agent off the road at t = 0: its off-road time does not count.
         dropped: road users within reach for which there was no body.
     """
 
-    own: ClassVar[tuple[str, ...]] = ("routes", "ghosts", "starts_off_road")
+    own: ClassVar[tuple[str, ...]] = ("routes", "ghosts", "overlapped", "starts_off_road")
 
     graph: RoadGraph
     signals: Int[Array, "*batch times lanes"]
@@ -73,6 +74,7 @@ class Road:
     kind: Int[Array, "*batch users"]
     present: Bool[Array, "*batch times users"]
     ghosts: Bool[Array, "*batch others"]
+    overlapped: Bool[Array, "*batch others"]
     starts_off_road: Bool[Array, "*batch"]
     dropped: Int[Array, "*batch"]
 
@@ -187,12 +189,12 @@ class Driving(Scene):
         place = jnp.where(road.present[times][..., None], place / FAR, 0.0)
         return jnp.concatenate([jnp.ravel(lights == RED), jnp.ravel(lights == GREEN), jnp.ravel(place), jnp.ravel(road.present[times])])
 
-    def ranges(self, expert: dict[str, np.ndarray]) -> dict[str, list[float]]:
+    def ranges(self, expert: Features) -> Ranges:
         """Of the curvature where lanes branch, 1/m, and of progress, m."""
-        return {"curvature": list(span(_on_branches(expert))), "progress": list(span(expert["progress"]))}
+        return {"curvature": span(_on_branches(expert)), "progress": span(expert["progress"])}
 
     def dress(self, spec: mujoco.MjSpec, episode: Episode) -> None:
-        """Kerbs, lanes, crosswalks and stop lines."""
+        """Kerbs, lanes, crosswalks, stop lines, and the ways that agents may go on."""
         scenery.dress(spec, episode.context, np.asarray(episode.start.qpos[:2]))
 
     def paint(self, model: mujoco.MjModel, episode: Episode, time: int) -> None:
@@ -235,6 +237,7 @@ class Driving(Scene):
             kind=log.kind[kept],
             present=present,
             ghosts=self.with_others(start, placed[0], size[0], lambda *near: capsule_gap(*near) < 0),
+            overlapped=self.with_others(start, placed[0], size[0], boxes_overlap),
             starts_off_road=self.each(lambda pose: jnp.any(past_edges(pose, log.road) > 0))(start),
             dropped=dropped,
         )
@@ -337,20 +340,20 @@ class Driving(Scene):
         touch, overlap = jax.vmap(one)(states, trajectory.actions, before, after)
         return jnp.any(touch, axis=0), jnp.any(overlap, axis=0)
 
-    def metrics(self, features: dict[str, np.ndarray], expert: dict[str, np.ndarray]) -> dict[str, float]:
+    def metrics(self, features: Features, expert: Features, ranges: Ranges | None = None) -> dict[str, float]:
         """Over (samples, episodes) and agents: rates, minADE in m, divergences in bits; bins span the range of the expert's.
 
         A minimum is over the samples, for each agent by itself; all else counts each agent of each sample alike.
         """
         here, there = (_on_branches(f) for f in (features, expert))
-        sampled = features["ade"].ndim > expert["ade"].ndim
+        limits, on_road = ranges or self.ranges(expert), features["may_leave_road"].astype(bool)
         return {
             "collision_rate": float(np.mean(features["collision"])),
             "overlap_rate": float(np.mean(features["overlap"])),
-            "offroad_time": float(np.mean(features["offroad"])),
-            "min_ade": float(np.mean(np.min(features["ade"], axis=0) if sampled else features["ade"])),
-            "curvature_jsd": metrics.jsd(here, there, bins=BINS, limits=span(there)),
-            "progress_jsd": metrics.jsd(features["progress"], expert["progress"], bins=BINS, limits=span(expert["progress"])),
+            "offroad_time": float(np.mean(features["offroad"], where=on_road)) if np.any(on_road) else 0.0,
+            "min_ade": float(np.mean(np.min(features["ade"], axis=0))),
+            "curvature_jsd": metrics.jsd(here, there, bins=BINS, limits=limits["curvature"]),
+            "progress_jsd": metrics.jsd(features["progress"], expert["progress"], bins=BINS, limits=limits["progress"]),
             "ran_red_rate": float(np.mean(features["ran_red"])),
         }
 
@@ -369,8 +372,9 @@ def _features(demonstration: Demonstration, trajectory: Trajectory, touch: Array
     bend, branching = jax.vmap(lambda q: _bend(road.routes, q[:2]))(qpos)
     return {
         "collision": jnp.any(touch & ~road.ghosts),
-        "overlap": jnp.any(overlap & ~road.ghosts),
-        "offroad": jnp.where(road.starts_off_road, 0.0, jnp.mean(past)),
+        "overlap": jnp.any(overlap & ~road.overlapped),
+        "offroad": jnp.mean(past),
+        "may_leave_road": jnp.any(road.graph.edge_valid) & ~road.starts_off_road,
         "ade": jnp.mean(jnp.sqrt(jnp.sum((qpos - demonstration.trajectory.states.qpos)[:, :2] ** 2, axis=1))),
         "progress": jnp.sqrt(jnp.sum((qpos[-1] - qpos[0])[:2] ** 2)),
         "curvature": bend,
@@ -441,6 +445,6 @@ def crossings(routes: Routes, qpos: Float[Array, "times 4"]) -> Bool[Array, "rou
 
 
 def ran_red(routes: Routes, crossed: Bool[Array, "routes steps"]) -> Bool[Array, ""]:
-    """Whether a stop line was crossed while its signal was red."""
+    """Whether a stop line was crossed while its signal was red: all of them, where routes on which the car still is cross together."""
     red = (routes.signals[:-1] == RED) & (routes.signals[1:] == RED)
-    return jnp.any(crossed & red.T)
+    return jnp.any(jnp.any(crossed, axis=0) & jnp.all(~crossed | red.T, axis=0))

@@ -27,7 +27,7 @@ from rtc_mjx.logs import RATE, LoggedScene
 from rtc_mjx.logs.convert import Control, Options
 from rtc_mjx.logs.store import Listed, listed, none_of
 from rtc_mjx.pytree import in_parts, pytree
-from rtc_mjx.scenes.base import Actor
+from rtc_mjx.scenes.base import Actor, Features, Ranges
 from rtc_mjx.scenes.driving import CONTROL_EVERY, Driving, Road
 from rtc_mjx.scenes.pool import PARTS, Part, Place, Pool, chosen, driven, gathered, of_part
 from rtc_mjx.scenes.routes import RouteOptions
@@ -192,14 +192,13 @@ class Recorded(Driving):
         return Actor((), lambda memory, observation, action: (memory, action), episode.context.actions), ()
 
     def features(self, demonstration: Demonstration, trajectory: Trajectory) -> dict[str, Array]:
-        """Those of driving; where lanes branch counts only if it is logged. `bounded`: whether there are road edges to cross."""
-        road, held = demonstration.episode.context, super().features(demonstration, trajectory)
-        return held | {"branching": held["branching"] & road.connected, "bounded": jnp.any(road.graph.edge_valid)}
+        """Those of driving; where lanes branch counts only if it is logged."""
+        held = super().features(demonstration, trajectory)
+        return held | {"branching": held["branching"] & demonstration.episode.context.connected}
 
-    def metrics(self, features: dict[str, np.ndarray], expert: dict[str, np.ndarray]) -> dict[str, float]:
-        """Those of driving; off-road time over scenes with road edges, the curvature JSD over those whose lane connectivity is logged."""
-        held, bounded = super().metrics(features, expert), features["bounded"]
-        held["offroad_time"] = float(np.sum(features["offroad"], where=bounded.astype(bool)) / max(1, np.sum(bounded)))
+    def metrics(self, features: Features, expert: Features, ranges: Ranges | None = None) -> dict[str, float]:
+        """Those of driving; the curvature JSD only where lane connectivity was logged for some."""
+        held = super().metrics(features, expert, ranges)
         return held if self.bends else {name: value for name, value in held.items() if name != "curvature_jsd"}
 
     @functools.cached_property

@@ -119,8 +119,7 @@ def _one_route(scene: LoggedScene, lanes: Int[Array, "depth"], start: Pose, opti
     there = lanes >= 0
     signalled = there & jnp.any(scene.signals[:, lanes] != NO_SIGNAL, axis=0) & (starts > origin + BEHIND)
     giving = there & (road.gives_way[lanes] > 0) & (starts > origin + BEHIND)
-    one_of_several = jnp.sum(road.successors[lanes] >= 0, axis=1) > 1
-    branch = jnp.concatenate([jnp.zeros(1, bool), one_of_several[:-1]]) & there
+    branch = there & jax.vmap(lambda lane: _one_of_several(road, lane))(lanes)
     index = jnp.clip(jnp.searchsorted(starts, origin + stations, side="right") - 1, 0, len(lanes) - 1)
 
     def first(mask: Array) -> tuple[Array, Array]:
@@ -137,10 +136,21 @@ def _one_route(scene: LoggedScene, lanes: Int[Array, "depth"], start: Pose, opti
         give_way=give_way,
         gives_way_to=jnp.where(jnp.any(giving), road.gives_way[lanes[yielding]], 0),
         branching=branch[index] & (origin + stations <= polyline_length(line)),
-        curvature=curvature(path, SPACING),
+        curvature=_smoothed(curvature(path, SPACING)),
         end=polyline_length(line) - origin,
         dropped=jnp.zeros((), int),
     )
+
+
+def _one_of_several(road: RoadGraph, lane: Int[Array, ""]) -> Bool[Array, ""]:
+    """Whether some lane goes on in this one and in others too."""
+    return jnp.any(jnp.any(road.successors == lane, axis=1) & (jnp.sum(road.successors >= 0, axis=1) > 1))
+
+
+def _smoothed(values: Float[Array, "points"]) -> Float[Array, "points"]:
+    """Means over a point and its neighbours: logged lines turn in corners, every few metres."""
+    long = jnp.concatenate([values[:1], values, values[-1:]])
+    return (long[:-2] + long[1:-1] + long[2:]) / 3
 
 
 _AXES = Routes(**{field.name: 1 if field.name == "signals" else 0 for field in dataclasses.fields(Routes)})  # type: ignore[arg-type]  # axes, not arrays

@@ -1,4 +1,7 @@
-"""What pictures of a driving scene show beside the bodies of its world: kerbs, lanes, crosswalks, stop lines in their signal's colour."""
+"""What pictures of a driving scene show beside the bodies of its world.
+
+Kerbs, lanes, crosswalks, stop lines in their signal's colour, and the agents' ways on.
+"""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
@@ -8,12 +11,13 @@ import numpy as np
 
 from rtc_mjx.logs import AMBER, GREEN, NO_SIGNAL, PEDESTRIAN, RED
 from rtc_mjx.logs.scene import lane_exists
+from rtc_mjx.scenes.routes import BEHIND, SPACING
 
 if TYPE_CHECKING:
     from rtc_mjx.scenes.driving import Road
 
 ASPHALT, SURFACE = (0.30, 0.31, 0.33), 1.9  # colour, and half the width in m
-KERB, LANE, STRIPE = (0.86, 0.86, 0.82), (0.62, 0.64, 0.60), (0.90, 0.90, 0.88)
+KERB, LANE, STRIPE, WAY = (0.86, 0.86, 0.82), (0.62, 0.64, 0.60), (0.90, 0.90, 0.88), (0.36, 0.55, 0.78)
 LIGHTS = {RED: (0.85, 0.16, 0.13), AMBER: (0.95, 0.70, 0.10), GREEN: (0.16, 0.66, 0.30), NO_SIGNAL: (0.5, 0.5, 0.5)}
 PERSON = (0.72, 0.22, 0.45)
 TALL = 0.9  # m, half the height of a person
@@ -36,6 +40,9 @@ def dress(spec: mujoco.MjSpec, road: "Road", start: np.ndarray) -> None:
     for corners in np.asarray(road.graph.crosswalks):
         for a, b in stripes(corners):
             _bar(spec, a, b, 0.22, 0.012, STRIPE, start)
+    for path in ways_on(road):
+        for a, b in zip(path[:-1], path[1:], strict=True):
+            _bar(spec, a, b, 0.07, 0.014, WAY, start)
     for index in np.flatnonzero(np.any(np.asarray(road.signals) != NO_SIGNAL, axis=0)):
         first, second = lanes[index][:2]
         way = (second - first) / max(1e-6, float(np.linalg.norm(second - first)))
@@ -56,6 +63,16 @@ def paint(model: mujoco.MjModel, road: "Road", size: np.ndarray, time: int) -> N
         if walks:
             model.geom_matid[body] = -1
             model.geom_rgba[body, :3] = PERSON
+
+
+def ways_on(road: "Road") -> Iterator[np.ndarray]:
+    """The routes that agents may take, from where they start: the points between which each is straight."""
+    routes = road.routes
+    points = np.asarray(routes.paths).shape[-2]
+    ahead = np.asarray(routes.paths).reshape(-1, points, 2)[:, round(BEHIND / SPACING) :]
+    for path, valid in zip(ahead, np.asarray(routes.valid).reshape(-1), strict=True):
+        if valid:
+            yield bends(path)
 
 
 def bends(lane: np.ndarray) -> np.ndarray:
