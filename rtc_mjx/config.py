@@ -305,6 +305,8 @@ def check(config: Config) -> Config:
         UsageError: the first that is not; one line with its option and what is accepted.
     """
     config = check_values(config)
+    if METHODS[config.method].kind == "label":
+        config = dataclasses.replace(config, scene=config.scene.labelled)
     if METHODS[config.method].kind == "label" and not config.scene.labels:
         raise UsageError(f"--method {config.method}: scene {config.scene.name} {config.scene.unlabelled}")
     return config

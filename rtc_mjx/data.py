@@ -18,9 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
@@ -28,9 +26,9 @@ from rich.table import Table
 from rtc_mjx import cli
 from rtc_mjx.errors import RunError, UsageError
 from rtc_mjx.logs import picture, read, store
-from rtc_mjx.logs.convert import Control, Conversion, Options
+from rtc_mjx.logs.convert import MOVES, Control, Conversion, Options
 from rtc_mjx.logs.recording import Recording
-from rtc_mjx.scenes.recorded import driven, fitted, follows
+from rtc_mjx.scenes.pool import driven, fitted, follows
 
 KINDS = ("of no kind", "vehicles", "pedestrians", "cyclists", "others")
 CONTROL_STEPS = 30  # of the 9 s of a scene
@@ -147,8 +145,8 @@ class Replays:
 
     def __init__(self) -> None:
         self.names: list[str] = []
-        self.poses: list[Array] = []  # of the agents only: of thousands of scenes that is little
-        self.velocities: list[Array] = []
+        self.poses: list[np.ndarray] = []  # of the agents only: of thousands of scenes that is little
+        self.velocities: list[np.ndarray] = []
         self.throughout: list[bool] = []
 
     def __call__(self, recording: Recording, became: Conversion | UsageError) -> None:
@@ -156,25 +154,35 @@ class Replays:
         for held in became.scenes if isinstance(became, Conversion) else ():
             poses, velocity = driven(held.scene, CONTROL_STEPS)
             self.names.append(held.name)
-            self.poses.append(poses)
-            self.velocities.append(velocity)
+            self.poses.append(np.asarray(poses))
+            self.velocities.append(np.asarray(velocity))
             self.throughout.append(bool(np.all(held.scene.valid[held.scene.controlled])))
 
     def tables(self) -> list[Table]:
-        """A row a scene, then a row over all agents that are there throughout."""
-        there = np.array(self.throughout)
-        fit = fitted(jnp.stack(self.poses), jnp.stack(self.velocities))
-        errors = {"position, m": fit.position_error, "heading, rad": fit.heading_error}
+        """A row a scene; rows over all agents that are there throughout; and over all positions of those of them that move."""
+        there, poses = np.array(self.throughout), np.stack(self.poses)
+        fit = fitted(poses, np.stack(self.velocities))
+        errors = {"position, m": np.asarray(fit.position_error), "heading, rad": np.asarray(fit.heading_error)}
         names = [f"{name} {what}" for name in errors for what in ("mean", "95 %")]
         columns = [column for error in errors.values() for column in (np.mean(error, axis=1), np.quantile(error, 0.95, axis=1))]
-        each, every = Table("scene", *names, "", title="replay by recovered controls"), Table("scenes", "of", *names, title="all of them")
+        each, every = Table("scene", *names, "", title="replay by recovered controls"), Table("scenes", "of", *names, title="all agents")
         for index, (name, good) in enumerate(zip(self.names, follows(fit), strict=True)):
             note = "the log ends early" if not there[index] else "" if good else "no car can follow"
             each.add_row(name, *(f"{column[index]:.3f}" for column in columns), note)
         for what, share in (("median agent", 0.5), ("95th percentile agent", 0.95)):
             told = [f"{np.quantile(column[there], share):.3f}" if np.any(there) else "-" for column in columns]
             every.add_row(f"{np.sum(there):,}", what, *told)
-        return [each, every]
+        away = np.max(np.linalg.norm(poses[..., :2] - poses[:, :1, :2], axis=-1), axis=1)
+        return [each, every, _pooled(errors, there & (away > MOVES))]
+
+
+def _pooled(errors: dict[str, np.ndarray], moving: np.ndarray) -> Table:
+    """Over all positions after the first of agents that move, whosever they are."""
+    out = Table("scenes", "of", "median", "95 %", title=f"all positions of agents that get more than {MOVES:g} m away")
+    for name, error in errors.items():
+        held = error[moving, 1:]
+        out.add_row(f"{np.sum(moving):,}", name, *(f"{np.quantile(held, share):.3f}" if held.size else "-" for share in (0.5, 0.95)))
+    return out
 
 
 def look(file: Path, options: Options, keep: bool, watchers: Sequence[store.Told], reporter: Reporter) -> Summary:

@@ -50,7 +50,7 @@ def entries(scene: str, methods: Sequence[str], ablate: bool, options: Sequence[
 def on_scene(scene: str, options: Sequence[str]) -> list[str]:
     """The methods that can run on a scene with these options."""
     held = config.from_command_line(["--scene", scene, "--method", "bc", *options], COMMAND).scene
-    return [name for name, method in METHODS.items() if method.kind != "label" or held.labels]
+    return [name for name, method in METHODS.items() if method.kind != "label" or held.labelled.labels]
 
 
 def whole_or_small(scene: str, methods: Sequence[str], folder: Path, small: Sequence[str]) -> dict[str, Run]:

@@ -214,6 +214,7 @@ def test_what_does_not_fit_is_dropped_farthest_first_and_counted(tmp_path):
     assert np.allclose(scene.scene.road.lanes[0, 0], [-5.0, 0.0]) and scene.scene.road.successors.tolist() == [[1], [-1]]
     assert conversion.dropped == {
         "road users beyond those that fit": 2, "lanes beyond those that fit": 2, "road edge segments beyond those that fit": 2,
+        "scenes in which the log comes nearest to a lane or road edge that does not fit": 2,
     }  # fmt: skip
 
 

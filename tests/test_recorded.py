@@ -12,19 +12,23 @@ import recorded as files
 from jax import random
 from made import made, recordings
 
-from rtc_mjx import config, dataset, evaluate, inverse_dynamics, train
+from rtc_mjx import config, data, dataset, evaluate, inverse_dynamics, reference, train
 from rtc_mjx.challenge import at_log_rate
 from rtc_mjx.config import Config
 from rtc_mjx.errors import UsageError
-from rtc_mjx.inverse_dynamics import FitOptions, fit, start_of
+from rtc_mjx.inverse_dynamics import Fit, FitOptions, fit, start_of
 from rtc_mjx.learner import compiled_chunk, start_all
+from rtc_mjx.logs import store
 from rtc_mjx.logs.convert import Options
 from rtc_mjx.logs.store import scenes
 from rtc_mjx.methods import METHODS
 from rtc_mjx.physics import rest_surroundings, simulate, specialised_step
 from rtc_mjx.runs import RECORDINGS
-from rtc_mjx.scenes.recorded import FOLLOWED, HEADED, Recorded, fitted, part_of
-from rtc_mjx.scenes.recorded import driven as logged
+from rtc_mjx.scenes import pool
+from rtc_mjx.scenes import recorded as recorded_scenes
+from rtc_mjx.scenes.pool import FOLLOWED, HEADED, fitted, part_of
+from rtc_mjx.scenes.pool import driven as logged
+from rtc_mjx.scenes.recorded import Recorded
 from rtc_mjx.team import ALONE, Team
 
 STEP, SUBSTEPS = 0.3, 6
@@ -96,12 +100,12 @@ def test_replayed_experts_stay_with_the_log():
 
 def test_parts_share_no_recording_and_leave_none_out():
     scene = made("womd")
-    parts = {part: part_of(scene.converted, part, scene.train_share) for part in ("train", "test")}
-    recorded = {part: {held.name.rsplit("/", 1)[0] for held in held} for part, held in parts.items()}
-    assert recorded["train"] and recorded["test"] and not recorded["train"] & recorded["test"]
-    fewer = part_of(scene.converted[len(scene.converted) // 2 :], "train", scene.train_share)
-    assert {held.name for held in fewer} <= {held.name for held in parts["train"]}  # no recording changes its part for others
-    assert sum(len(held) for held in parts.values()) == len(scene.converted)
+    parts = {part: scene.available(part) for part in ("train", "test")}
+    names = {part: {place.scenario for place in held} for part, held in parts.items()}
+    assert names["train"] and names["test"] and not names["train"] & names["test"]
+    fewer = part_of(sorted(names["train"] | names["test"])[3:], "train", scene.train_share)
+    assert fewer <= names["train"]  # no recording changes its part for others
+    assert sum(len(held) for held in parts.values()) == len(scene.places)
 
 
 def test_recordings_that_are_not_there_leave_no_run_behind(tmp_path):
@@ -197,3 +201,120 @@ def test_poses_at_the_rate_of_the_log_pass_through_those_of_the_control_steps():
     assert np.allclose(fine[2::3, jnp.array([0, 1, 3])], one.trajectory.states.qpos[1:, :3], atol=2e-3)
     step = np.linalg.norm(np.diff(fine[:, :2], axis=0), axis=1)
     assert np.max(np.abs(np.diff(step))) < 0.2  # no jump between control steps: less than 20 m/s^2
+
+
+# What is chosen of recordings, and what is said of the rest
+
+
+@pytest.fixture
+def mixed(tmp_path, monkeypatch):
+    """Six recordings that log connectivity, three that do not; all agents are taken to be followed, without looking for controls."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(pool, "fitted", with_errors(lambda scenes: np.zeros(scenes)))
+    (tmp_path / "in").mkdir()
+    shard = files.tfrecord(*(files.scenario(f"w{i}").SerializeToString() for i in range(6)))
+    (tmp_path / "in" / "shard").write_bytes(shard)
+    for i in range(3):
+        (tmp_path / "in" / f"g{i}.json").write_text(json.dumps(files.gpudrive() | {"scenario_id": f"g{i}"}))
+    yield tmp_path / "in"
+    recorded_scenes._pool.cache_clear()
+
+
+def with_errors(of):
+    """In place of `fitted`: controls of nothing, with these errors in m."""
+
+    def fitted(poses, velocity):
+        error = np.tile(of(len(poses))[:, None], poses.shape[1])
+        return Fit(np.zeros((len(poses), poses.shape[1] - 1, 2), np.float32), error, 0 * error)
+
+    return fitted
+
+
+def test_what_the_command_converted_a_training_converts_no_more(mixed, monkeypatch):
+    data.main([str(mixed), "--convert"])
+    monkeypatch.setattr(store, "convert", None)  # from here on nothing is converted
+    scene = Recorded(data=str(mixed))
+    assert len(scene.listed) == 9 and len(scene.pool("train").names) + len(scene.pool("test").names) == 18
+
+
+def test_no_more_scenes_are_held_than_asked_for_and_a_hash_chooses_them(mixed):
+    every, few = Recorded(data=str(mixed)), Recorded(data=str(mixed), most=6)
+    assert (len(few.pool("train").names), len(few.pool("test").names)) == (4, 2)
+    assert all(len(x) == 4 for x in jax.tree.leaves(few.pool("train").logs))
+    assert few.pool("train").names == every.pool("train").names[:4]
+    there = every.available("train")
+    assert few.counts()["scenes to learn from beyond those that are held (--scene.most)"] == len(there) - 4
+    assert [p.name for p in pool.chosen(there[::-1], 4)] == [p.name for p in pool.chosen(there, 4)] != [p.name for p in there[:4]]
+    for name, log in zip(few.pool("train").names, few.pool("train").logs.pose, strict=True):  # each with its own log
+        assert log[0, 30, 0] == pytest.approx(30.0 if name.endswith("/11") else 27.0, abs=0.02)
+
+
+def test_what_conversion_dropped_is_among_the_notes(mixed):
+    told = Recorded(data=str(mixed)).converted()
+    assert told["bike lanes, not for driving (in converting 9 recordings to 18 scenes)"] == 9
+
+
+def test_counts_tell_both_parts_and_who_was_left_out_and_why(mixed, monkeypatch):
+    monkeypatch.setattr(pool, "fitted", with_errors(lambda scenes: np.where(np.arange(scenes) == 1, 3.0, 0.0)))
+    told = Recorded(data=str(mixed)).counts()
+    assert told["recordings to learn from"] + told["recordings to test on"] == 9
+    assert told["scenes to learn from"] + told["scenes to test on"] == 16
+    assert told["agents that no car can follow (left out)"] == 2 and "agents whose log ends early (left out)" not in told
+
+
+def test_where_nobody_is_left_the_reasons_are_told_apart(mixed, monkeypatch):
+    scene = Recorded(data=str(mixed))
+    monkeypatch.setattr(pool, "fitted", with_errors(lambda scenes: np.full(scenes, 3.0)))
+    with pytest.raises(UsageError, match=r"to learn from, none of \d+ agents is left: 0 logs end early, and \d+ no car can follow"):
+        scene.pool("train")
+    monkeypatch.setattr(pool, "_agents", lambda logs, steps: (*agents(logs, steps)[:2], np.zeros(len(logs.kind), bool)))
+    with pytest.raises(UsageError, match=r"left: [1-9]\d* logs end early, and 0 no car can follow"):
+        scene.pool("train")
+
+
+agents = pool._agents
+
+
+def test_symphony_leaves_out_recordings_that_do_not_log_connectivity_and_says_how_many(mixed):
+    argv = ["--scene", "womd", "--scene.data", str(mixed)]
+    for method, count in (("symphony", 12), ("bc", 18)):
+        scene = config.from_command_line([*argv, "--method", method], "train").scene
+        assert len(scene.places) == count and bool(scene.labels) == (method == "symphony")
+    unused = "scenes of recordings that do not log lane connectivity (left out)"
+    assert dataclasses.replace(scene, only_connected=True).counts()[unused] == 6 and unused not in scene.counts()
+    for file in mixed.glob("shard"):
+        file.unlink()
+    with pytest.raises(UsageError, match="none of the recordings"):
+        _ = Recorded(data=str(mixed), only_connected=True).places
+
+
+def test_curvature_is_left_out_only_where_no_recording_logs_connectivity(mixed):
+    held = {name: np.zeros((1, 2)) for name in ("collision", "overlap", "offroad", "may_leave_road", "ade", "progress", "ran_red")}
+    held |= {"curvature": np.array([[[0.1, 0.2], [9.0, 9.0]]]), "branching": np.array([[[True, True], [False, False]]])}
+    assert Recorded(data=str(mixed)).metrics(held, held)["curvature_jsd"] == 0.0
+    (mixed / "shard").unlink()
+    assert "curvature_jsd" not in Recorded(data=str(mixed)).metrics(held, held)
+
+
+@pytest.mark.usefixtures("quick_to_compile")
+def test_features_and_notes_say_what_a_recording_lacks(mixed):
+    """Those that do not log connectivity have no road edges either: they count for neither curvature nor off-road time."""
+    for i in range(3):
+        lacking = files.gpudrive() | {"scenario_id": f"g{i}"}
+        lacking["roads"] = [road for road in lacking["roads"] if road["type"] != "road_edge"]
+        (mixed / f"g{i}.json").write_text(json.dumps(lacking))
+    scene = Recorded(data=str(mixed), steps=3, road_users=1)
+    held = dataset.demonstrations(scene, 99, dataset.TRAIN)
+    lacks = np.array([name.startswith("g") for name in scene.pool("train").names])
+    told = reference.expert_features(scene, held)
+    assert 0 < np.sum(lacks) < len(lacks)
+    assert not np.any(told["may_leave_road"][lacks]) and not np.any(told["branching"][lacks])
+    notes = scene.notes(held.episode)
+    assert notes["test episodes without road edges (not in offroad_time)"] == np.sum(lacks)
+    assert notes["test episodes whose lanes are not logged as connected (not in curvature_jsd)"] == np.sum(lacks)
+
+
+def test_a_training_says_what_it_learns_from(mixed, capsys):
+    Recorded(data=str(mixed)).ready()
+    said = capsys.readouterr().err
+    assert "recordings to learn from" in said and "recordings to test on" in said and len(said.splitlines()) == 1

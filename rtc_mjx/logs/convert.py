@@ -1,7 +1,8 @@
 """A recording -> logged scenes of fixed sizes, one for each agent that is to be controlled.
 
     recording -> window of 9 s at 10 Hz (`window`) -> roads with few points and ways on (`road`)
-              -> for each controlled agent: what is on its level, nearest first, in metres from where it starts -> `checked`
+              -> for each controlled agent: what is on its level (`levels`), roads first that are near where it can go (`reach`), in
+                 metres from where it starts -> `checked`
 
 Nothing is dropped in silence: `Conversion` counts it, in words.
 """
@@ -17,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from rtc_mjx.errors import UsageError
 from rtc_mjx.logs.check import checked
 from rtc_mjx.logs.levels import Level, Samples, level_of, sampled
+from rtc_mjx.logs.reach import reachable, remoteness
 from rtc_mjx.logs.recording import OTHER, Recording, Tracks, refuse_if
 from rtc_mjx.logs.road import Connectivity, Roads, prepare
 from rtc_mjx.logs.scene import CYCLIST, VEHICLE, LoggedScene, RoadGraph
@@ -32,6 +34,8 @@ THINNED = 5  # every which logged pose of the agent heights are compared with
 class Options:
     """Which scenes are made, and how large they may be; what does not fit is dropped farthest first, and counted.
 
+    The defaults are those of trainings on recordings, so that scenes converted beforehand are the ones they look for.
+
     Attributes:
         control: whose scenes: the self-driving car's, those of `tracks_to_predict`, or of every vehicle that is there throughout and moves
             more than 5 m.
@@ -46,11 +50,11 @@ class Options:
 
     control: Control = "moving"
     start: float = 0.0
-    road_users: int = 64
-    lanes: int = 256
-    points: int = 32
+    road_users: int = 24
+    lanes: int = 128
+    points: int = 24
     successors: int = 4
-    edges: int = 1024
+    edges: int = 640
     crosswalks: int = 16
 
     def __post_init__(self) -> None:
@@ -146,9 +150,12 @@ def _scene(recording: Recording, tracks: Tracks, roads: Roads, agent: int, optio
     name = f"{recording.scenario or recording.source}/{tracks.ids[agent]}"
     ground = on_the_ground(tracks)
     origin, path = ground[agent, 0], ground[agent][tracks.valid[agent]][::THINNED]
-    level = level_of(roads, path, float(tracks.pose[agent, 0, 3])) if recording.map.heights else None
+    heading, speed = float(tracks.pose[agent, 0, 3]), float(np.linalg.norm(tracks.velocity[agent, 0]))
+    level = level_of(roads, path, heading) if recording.map.heights else None
     kept = _users(tracks, ground, agent, level, options.road_users, notes)
-    graph, signals = _graph(roads, origin, level, options, notes)
+    ranked = Ranking(reachable(roads, origin, heading, speed), level, path, notes)
+    graph, signals = _graph(roads, origin, ranked, options)
+    notes["scenes in which the log comes nearest to a lane or road edge that does not fit"] += ranked.missed
     pose, velocity, size, kind, valid = (_room(x, options.road_users) for x in _selected(tracks, kept, origin, notes))
     fields: dict[str, Any] = {
         "road": graph, "signals": signals, "pose": pose, "velocity": velocity, "size": size, "kind": kind, "valid": valid,
@@ -212,18 +219,48 @@ def _room(x: np.ndarray, count: int) -> np.ndarray:
     return np.pad(x, [(0, count - len(x)), *[(0, 0)] * (x.ndim - 1)])
 
 
-def _graph(roads: Roads, origin: np.ndarray, level: Level | None, options: Options, notes: Counter[str]) -> tuple[RoadGraph, np.ndarray]:
+class Ranking:
+    """Which lines and areas of a map are an agent's, those first that are near where it can go."""
+
+    def __init__(self, places: np.ndarray, level: Level | None, path: np.ndarray, notes: Counter[str]) -> None:
+        self.places, self.level, self.path, self.notes = places, level, path, notes
+        self.missed = False  # whether the logged path comes nearest to something that does not fit; it is only counted
+
+    def __call__(self, what: str, shapes: np.ndarray, most: int) -> np.ndarray:
+        """Indices of the first `most`."""
+        if not len(shapes):
+            return np.zeros(0, int)
+        here = self.level.holds(sampled(shapes), len(shapes)) if self.level else np.ones(len(shapes), bool)
+        if self.level and what == "lanes":
+            here[list(self.level.lanes)] = True
+        order = np.argsort(np.where(here, remoteness(shapes, self.places), np.inf), kind="stable")[: int(np.sum(here))]
+        self.notes[f"{what} on another level, left out"] += int(np.sum(~here))
+        self.notes[f"{what} beyond those that fit"] += max(0, len(order) - most)
+        if len(order) > most and what != "crosswalks":
+            nearest = [int(np.argmin(_away(shapes[order], point))) for point in self.path]
+            self.missed |= max(nearest) >= most
+        return order[:most]
+
+
+def _away(shapes: np.ndarray, point: np.ndarray) -> Float[np.ndarray, "shapes"]:
+    """How far lines are from a point in the plane, m."""
+    a, way = shapes[:, :-1, :2], np.diff(shapes[..., :2], axis=1)
+    share = np.clip(np.sum((point[:2] - a) * way, axis=-1) / np.maximum(np.sum(way**2, axis=-1), 1e-12), 0, 1)
+    return np.min(np.linalg.norm(a + share[..., None] * way - point[:2], axis=-1), axis=1)
+
+
+def _graph(roads: Roads, origin: np.ndarray, ranked: Ranking, options: Options) -> tuple[RoadGraph, np.ndarray]:
     """The road graph about an agent, and the signals of its lanes."""
-    lanes = _nearest("lanes", roads.lanes, origin, level, options.lanes, notes)
-    edges = _nearest("road edge segments", roads.edges, origin, level, options.edges, notes)
-    crosswalks = _nearest("crosswalks", roads.crosswalks, origin, level, options.crosswalks, notes)
+    lanes = ranked("lanes", roads.lanes, options.lanes)
+    edges = ranked("road edge segments", roads.edges, options.edges)
+    crosswalks = ranked("crosswalks", roads.crosswalks, options.crosswalks)
 
     def moved(x: np.ndarray, count: int) -> np.ndarray:
         return _room((x[..., :2] - origin[:2]).astype(np.float32), count)
 
     fields: dict[str, Any] = {
         "lanes": moved(roads.lanes[lanes], options.lanes),
-        "successors": _successors(roads, lanes, options, notes),
+        "successors": _successors(roads, lanes, options, ranked.notes),
         "gives_way": _room(roads.gives_way[lanes], options.lanes).astype(np.int32),
         "edges": moved(roads.edges[edges], options.edges),
         "edge_valid": np.arange(options.edges) < len(edges),
@@ -231,28 +268,6 @@ def _graph(roads: Roads, origin: np.ndarray, level: Level | None, options: Optio
     }
     signals = _room(roads.signals[:, lanes].T, options.lanes).T
     return RoadGraph(**fields), signals.astype(np.int32)
-
-
-def _nearest(what: str, shapes: np.ndarray, origin: np.ndarray, level: Level | None, most: int, notes: Counter[str]) -> np.ndarray:
-    """Of lines or areas, those on the agent's level, nearest to where it starts first, which tells nothing of its future."""
-    if not len(shapes):
-        return np.zeros(0, int)
-    here = level.holds(sampled(shapes), len(shapes)) if level else np.ones(len(shapes), bool)
-    if level and what == "lanes":
-        here[list(level.lanes)] = True
-    reach = np.min(_to_segments(shapes, origin), axis=1)
-    order = np.argsort(np.where(here, reach, np.inf), kind="stable")[: int(np.sum(here))]
-    notes[f"{what} on another level, left out"] += int(np.sum(~here))
-    notes[f"{what} beyond those that fit"] += max(0, len(order) - most)
-    return order[:most]
-
-
-def _to_segments(shapes: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """How far the pieces of each line are from a point in the plane."""
-    a, b = shapes[:, :-1, :2], shapes[:, 1:, :2]
-    way = b - a
-    share = np.clip(np.sum((point[:2] - a) * way, axis=-1) / np.maximum(np.sum(way**2, axis=-1), 1e-12), 0, 1)
-    return np.linalg.norm(a + share[..., None] * way - point[:2], axis=-1)
 
 
 def _successors(roads: Roads, lanes: np.ndarray, options: Options, notes: Counter[str]) -> Int[np.ndarray, "lanes next"]:

@@ -4,6 +4,7 @@ The agent's own level is known along its logged path and along the lanes that go
 height by more than a vehicle's clearance is on another level; farther away, roads may climb.
 """
 
+import heapq
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,37 +35,56 @@ class Samples:
 
 def sampled(shapes: Float[np.ndarray, "shapes points 3"]) -> Samples:
     """Points every SAMPLED m along lines, or the sides of areas."""
+    return sampled_along(shapes)[0]
+
+
+def sampled_along(shapes: Float[np.ndarray, "shapes points 3"]) -> tuple[Samples, Float[np.ndarray, "samples"]]:
+    """The same, and how far in m along its shape each point is."""
     a, b = shapes[:, :-1], shapes[:, 1:]
-    pieces = np.clip(np.ceil(np.linalg.norm((b - a)[..., :2], axis=-1) / SAMPLED), 1, MOST).astype(int).reshape(-1)
+    length = np.linalg.norm((b - a)[..., :2], axis=-1)
+    pieces = np.clip(np.ceil(length / SAMPLED), 1, MOST).astype(int).reshape(-1)
     piece = np.repeat(np.arange(len(pieces)), pieces)
     step = np.arange(len(piece)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
     share = (step + 0.5) / pieces[piece]
     points = a.reshape(-1, 3)[piece] + share[:, None] * (b - a).reshape(-1, 3)[piece]
-    return Samples(points, piece // max(1, shapes.shape[1] - 1))
+    along = (np.cumsum(length, axis=1) - length).reshape(-1)[piece] + share * length.reshape(-1)[piece]
+    return Samples(points, piece // max(1, shapes.shape[1] - 1)), along
 
 
-def way_on(roads: Roads, start: Float[np.ndarray, "3"], heading: float) -> list[int]:
-    """The lanes within AHEAD m of the one an agent is on, itself included."""
-    first, after = roads.lanes[:, :-1], roads.lanes[:, 1:]
-    way = after - first
+def ways_on(roads: Roads, start: Float[np.ndarray, "3"], heading: float, reach: float, beside: float = 0.0) -> dict[int, float]:
+    """The lanes that an agent gets to, and for each how far in m it is to its first point; negative where that lies behind.
+
+    Args:
+        roads: of the recording.
+        start: where the agent is, on the ground.
+        heading: of the agent, rad.
+        reach: m along lanes, beyond which none begins.
+        beside: m to lanes that it may set out on as well as on the nearest; all go its way and are on its level.
+    """
+    away, along, length = _from_lanes(roads, start, heading)
+    nearest, piece = np.min(away, axis=1), np.argmin(away, axis=1)
+    near = np.flatnonzero(np.isfinite(nearest) & (nearest <= max(beside, float(np.min(nearest)))))
+    waiting, found = [(-float(along[lane, piece[lane]]), int(lane)) for lane in near], dict[int, float]()
+    heapq.heapify(waiting)
+    while waiting:  # the lane that begins nearest comes first, so that the shortest way to each counts
+        begins, lane = heapq.heappop(waiting)
+        if lane not in found and begins < reach:
+            found[lane] = begins
+            for other in roads.successors[lane]:
+                heapq.heappush(waiting, (begins + float(length[lane]), other))
+    return found
+
+
+def _from_lanes(roads: Roads, start: np.ndarray, heading: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How far in m each piece of each lane is, infinite where it is not the agent's; how far along the lane that is; lanes' lengths."""
+    first, way = roads.lanes[:, :-1], np.diff(roads.lanes, axis=1)
     length = np.linalg.norm(way[..., :2], axis=-1)
     share = np.clip(np.sum((start - first)[..., :2] * way[..., :2], axis=-1) / np.maximum(length**2, 1e-12), 0, 1)
     off = first + share[..., None] * way - start
     turned = np.abs((np.arctan2(way[..., 1], way[..., 0]) - heading + np.pi) % (2 * np.pi) - np.pi)
     odd = (length == 0) | (turned > np.pi / 3) | (np.abs(off[..., 2]) > CLEARANCE)
-    away = np.where(odd, np.inf, np.linalg.norm(off[..., :2], axis=-1)).min(axis=1)
-    if not np.any(np.isfinite(away)):
-        return []
-    lane = int(np.argmin(away))
-    found, waiting = {lane: 0.0}, [lane]
-    while waiting:
-        lane = waiting.pop(0)
-        reached = found[lane] + float(length[lane].sum())
-        for other in roads.successors[lane]:
-            if reached < AHEAD and other not in found:
-                found[other] = reached
-                waiting.append(other)
-    return list(found)
+    away = np.where(odd, np.inf, np.linalg.norm(off[..., :2], axis=-1))
+    return away, np.cumsum(length, axis=1) - length + share * length, np.sum(length, axis=1)
 
 
 @dataclass(frozen=True)
@@ -94,6 +114,6 @@ class Level:
 
 def level_of(roads: Roads, path: Float[np.ndarray, "poses 3"], heading: float) -> Level:
     """The level of an agent that takes a path on the ground and starts with a heading."""
-    lanes = way_on(roads, path[0], heading)
+    lanes = list(ways_on(roads, path[0], heading, AHEAD))
     points = np.concatenate([path, sampled(roads.lanes[lanes]).points])
     return Level(cKDTree(points[:, :2]), points[:, 2], frozenset(lanes))

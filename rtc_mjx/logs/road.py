@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from rtc_mjx.logs.recording import SIGNAL_STATES, Lane, Recording, refuse_if
 from rtc_mjx.logs.scene import AMBER, GREEN, NO_SIGNAL, RED
@@ -29,6 +29,9 @@ COLOURS = {
     "unknown": NO_SIGNAL, "arrow_stop": RED, "arrow_caution": AMBER, "arrow_go": GREEN, "stop": RED, "caution": AMBER, "go": GREEN,
     "flashing_stop": NO_SIGNAL, "flashing_caution": NO_SIGNAL,
 }  # fmt: skip
+FLASHING = SIGNAL_STATES.index("flashing_stop")
+OFF_STOP = 5.0  # m
+FARTHEST = 1e6  # m, beyond which a coordinate is no place
 COLOUR = np.array([COLOURS[state] for state in SIGNAL_STATES])
 
 
@@ -68,10 +71,10 @@ def prepare(recording: Recording, points: int) -> Roads:
     usable, kept = _drivable(recording, notes)
     lines = [_lane_line(line, points, notes) for line in kept]
     index = {lane.id: i for i, lane in enumerate(usable)}
-    logged = recording.map.connected
+    logged = recording.map.connected and any(lane.entries or lane.exits for lane in recording.map.lanes)
     successors = _logged(recording, index) if logged else derived(kept)
     gives_way = _stop_signs(recording, index, notes)
-    signals = _signals(recording, index, gives_way, notes)
+    signals = _signals(recording, index, kept, successors, gives_way, notes)
     return Roads(
         lanes=np.array(lines).reshape(-1, points, 3),
         successors=successors,
@@ -104,7 +107,7 @@ def _drivable(recording: Recording, notes: Counter[str]) -> tuple[list[Lane], li
 
 def cleaned(line: Float[np.ndarray, "points 3"], notes: Counter[str]) -> np.ndarray:
     """Without points that are not finite and without repetitions."""
-    good = np.all(np.isfinite(line) & (np.abs(line) < 1e6), axis=1)
+    good = np.all(np.isfinite(line) & (np.abs(line) < FARTHEST), axis=1)
     notes["map points that are not finite or beyond 1,000 km, dropped"] += int(np.sum(~good))
     line = line[good]
     new = np.any(np.diff(line[:, :2], axis=0) != 0, axis=1)
@@ -199,18 +202,59 @@ def _stop_signs(recording: Recording, index: dict[str, int], notes: Counter[str]
     return gives_way
 
 
-def _signals(recording: Recording, index: dict[str, int], gives_way: np.ndarray, notes: Counter[str]) -> np.ndarray:
-    """States by logged time and lane: a light belongs to the lane that starts at its stop point. Flashing red gives way."""
+def _signals(
+    recording: Recording, index: dict[str, int], lines: list[np.ndarray], successors: tuple[tuple[int, ...], ...], gives_way: np.ndarray,
+    notes: Counter[str],
+) -> np.ndarray:  # fmt: skip
+    """States by logged time and lane: a light belongs to the lane that starts at its stop point. Flashing red gives way.
+
+    Where the stop point is past the middle of the lane that a light is logged for, it belongs to the lanes that go on from there.
+    """
     told = recording.signals
     table = np.full((len(recording.times), len(index)), NO_SIGNAL)
     lane = np.array([index.get(name, -1) for name in told.lane], int)
-    known = lane >= 0
-    table[told.time[known], lane[known]] = COLOUR[told.state[known]]
-    flashing = known & (told.state == SIGNAL_STATES.index("flashing_stop"))
-    gives_way[lane[flashing]] = EVERYBODY
-    notes["signal states of bike lanes or of lanes not in the file, dropped"] += int(np.sum(~known))
+    notes["signal states of bike lanes or of lanes not in the file, dropped"] += int(np.sum(lane < 0))
     notes["signal states unknown, taken as no signal"] += int(np.sum(told.state == 0))
+    late = _late(lane, told.stop, lines, notes)
+    notes["signal states whose stop point is past the middle of a lane, given to the lanes that go on"] += int(np.sum(late))
+    for beyond in (True, False):  # what is logged for a lane itself comes last, and stays
+        for lit in np.unique(lane[(lane >= 0) & (late == beyond)]):
+            held = (lane == lit) & (late == beyond)
+            ruled = successors[lit] if beyond else (lit,)
+            notes["of these, dropped: no lane goes on"] += 0 if ruled else int(np.sum(held))
+            for other in ruled:
+                table[told.time[held], other] = COLOUR[told.state[held]]
+                if np.any(told.state[held] == FLASHING):
+                    gives_way[other] = EVERYBODY
     return table
+
+
+def _late(lane: np.ndarray, stop: np.ndarray, lines: list[np.ndarray], notes: Counter[str]) -> Bool[np.ndarray, "states"]:
+    """Of each signal state, whether its stop point is past the middle of its lane; those that then stand far from it are counted."""
+    late, off = np.zeros(len(lane), bool), np.zeros(len(lane))
+    known = np.flatnonzero((lane >= 0) & np.all(np.abs(stop) < FARTHEST, axis=1))  # false for NaN
+    for number, where in zip(*_alike(lane[known], stop[known, :2]), strict=True):
+        line, point = lines[lane[known[number]]][:, :2], stop[known[number], :2]
+        late[known[where]] = past = _share_along(line, point) > 0.5
+        off[known[where]] = np.linalg.norm(line[-1 if past else 0] - point)
+    notes[f"signal states put more than {OFF_STOP:g} m from their stop point"] += int(np.sum(off > OFF_STOP))
+    return late
+
+
+def _alike(lane: np.ndarray, stop: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The first of each group of states with one lane and stop point, and all of it: a light stands where it does at all times."""
+    _, first, group = np.unique(np.column_stack([lane, stop]), axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(group.reshape(-1), kind="stable")
+    return first, np.split(order, np.cumsum(np.bincount(group.reshape(-1)))[:-1]) if len(lane) else []
+
+
+def _share_along(line: np.ndarray, point: np.ndarray) -> float:
+    """Where on a line the point nearest to a place is: 0 at its start, 1 at its end."""
+    way = np.diff(line, axis=0)
+    length = np.linalg.norm(way, axis=1)
+    share = np.clip(np.sum((point - line[:-1]) * way, axis=1) / length**2, 0, 1)
+    piece = int(np.argmin(np.linalg.norm(line[:-1] + share[:, None] * way - point, axis=1)))
+    return float((np.sum(length[:piece]) + share[piece] * length[piece]) / np.sum(length))
 
 
 def _edges(recording: Recording, notes: Counter[str]) -> np.ndarray:

@@ -96,6 +96,11 @@ class Scene(abc.ABC):
         return 0
 
     @property
+    def labelled(self) -> "Scene":
+        """The same scene without episodes that have no hand-made type, where others have one."""
+        return self
+
+    @property
     def unlabelled(self) -> str:
         """Why there are no hand-made types, where there are none."""
         return "has no hand-made labels"
