@@ -4,7 +4,6 @@ import dataclasses
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,9 +18,8 @@ from rtc_mjx.rollout import rollout
 from rtc_mjx.scenes import Scene
 from rtc_mjx.trajectory import Demonstration, Episode
 
-TRAIN, TEST, SECOND_TEST, PROBED = range(
-    4
-)  # seeds of the independent sets: to learn from, to compare with, to compare these with, to probe
+# seeds of the independent sets: to learn from, to compare with, to compare these with, to probe
+TRAIN, TEST, SECOND_TEST, PROBED = 0, 1, 2, 3
 CHUNK = 1024  # episodes simulated at once
 
 
@@ -60,7 +58,7 @@ def demonstrations(scene: Scene, count: int, seed: int) -> Demonstration:
     file = cache.folder() / "demonstrations" / f"{scene.name}-{fingerprint(scene, count, seed)}.npz"
     leaves = _fitting(cache.read_arrays(file), jax.tree.leaves(shapes))
     if leaves is None:
-        leaves = jax.tree.leaves(made(make, count, seed, CHUNK))
+        leaves = jax.tree.leaves(_made(make, count, seed, CHUNK))
         cache.write_arrays(file, {str(i): x for i, x in enumerate(leaves)})
     return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
 
@@ -77,21 +75,17 @@ def by_others(scene: Scene, count: int, seed: int, minds: int) -> Demonstration:
     Raises:
         UsageError: the scene's episodes have one expert each.
     """
-    again = jax.jit(jax.vmap(lambda key: driven_by_others(scene, key, range(minds))))
-    return made(again, count, seed, max(1, CHUNK // minds))
 
+    def again(key: jax.Array) -> Demonstration:
+        outside, inside = jax.random.split(key)
+        episode = scene.reset(outside)
 
-def driven_by_others(scene: Scene, key: jax.Array, minds: range) -> Demonstration:
-    """The episode of a key driven by other experts than that of `demonstrate`, one for each number; leading axis of these.
+        return jax.vmap(lambda mind: driven(scene, episode, jax.random.fold_in(inside, mind)))(1 + jnp.arange(minds))
 
-    Raises:
-        UsageError: the scene's episodes have one expert each.
-    """
     if not scene.redrivable:
         raise UsageError(f"scene {scene.name}: recorded episodes have one expert each")
-    outside, inside = jax.random.split(key)
-    episode = scene.reset(outside)
-    return jax.vmap(lambda mind: driven(scene, episode, jax.random.fold_in(inside, mind)))(1 + jnp.asarray(minds))
+
+    return _made(jax.jit(jax.vmap(again)), count, seed, max(1, CHUNK // minds))
 
 
 def redriven(scene: Scene, count: int, seed: int, change: Callable[[Episode], Episode | None]) -> Demonstration:
@@ -100,10 +94,10 @@ def redriven(scene: Scene, count: int, seed: int, change: Callable[[Episode], Ep
     Raises:
         UsageError: the scene has nothing to change.
     """
-    return made(jax.jit(jax.vmap(lambda key: demonstrate(scene, key, change))), count, seed, CHUNK)
+    return _made(jax.jit(jax.vmap(lambda key: demonstrate(scene, key, change))), count, seed, CHUNK)
 
 
-def made(make: Callable[[jax.Array], Any], count: int, seed: int, at_once: int) -> Any:
+def _made(make: Callable[[jax.Array], Demonstration], count: int, seed: int, at_once: int) -> Demonstration:
     """What a function makes of the keys of a seed's episodes, as numpy arrays."""
     return in_parts(make, jax.random.split(stream("demonstrations", seed), count), at_once)
 

@@ -4,7 +4,7 @@ from typing import Literal, get_args
 
 import jax
 
-Stream = Literal["networks", "updates", "demonstrations", "evaluation", "environment", "type shift"]
+Stream = Literal["networks", "updates", "demonstrations", "evaluation", "environment", "type shift", "reference"]
 
 
 def stream(purpose: Stream, seed: jax.Array | int) -> jax.Array:

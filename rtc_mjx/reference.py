@@ -6,10 +6,13 @@ such group against the first is the floor. Of recorded episodes there is one exp
 """
 
 import jax
-import numpy as np
+import jax.numpy as jnp
+from jax import random
 from jaxtyping import Array
 
 from rtc_mjx import cache, dataset
+from rtc_mjx.keys import stream
+from rtc_mjx.pytree import in_parts
 from rtc_mjx.scenes import Features, Scene
 from rtc_mjx.trajectory import Demonstration
 
@@ -23,39 +26,44 @@ def expert_features(scene: Scene, test: Demonstration) -> Features:
 
 def experts(scene: Scene, count: int) -> Features:
     """Features of what agents are compared with: (experts, episodes, ...), as many experts an episode as an agent has rollouts."""
-    if _several(scene):
-        return _of_others(scene, count, range(scene.samples))
-    return _of_demonstrations(scene, count, dataset.TEST)
+    return _groups(scene, count)[0]
 
 
 def more_experts(scene: Scene, count: int) -> Features:
     """Features of as many experts again: of the same episodes where an agent has several rollouts of each, of others elsewhere."""
-    if _several(scene):
-        return _of_others(scene, count, range(scene.samples, 2 * scene.samples))
-    return _of_demonstrations(scene, count, dataset.SECOND_TEST)
+    return _groups(scene, count)[1]
 
 
-def _several(scene: Scene) -> bool:
-    return scene.redrivable and scene.samples > 1
+def _groups(scene: Scene, count: int) -> tuple[Features, Features]:
+    if scene.redrivable and scene.samples > 1:
+        both = _of_others(scene, count)
+        return {name: x[: scene.samples] for name, x in both.items()}, {name: x[scene.samples :] for name, x in both.items()}
+    first, second = (expert_features(scene, dataset.demonstrations(scene, count, seed)) for seed in (dataset.TEST, dataset.SECOND_TEST))
+    return {name: x[None] for name, x in first.items()}, {name: x[None] for name, x in second.items()}
 
 
-def _of_demonstrations(scene: Scene, count: int, seed: int) -> Features:
-    held = expert_features(scene, dataset.demonstrations(scene, count, seed))
-    return {name: x[None] for name, x in held.items()}
-
-
-def _of_others(scene: Scene, count: int, minds: range) -> Features:
-    """Features of other experts in the test episodes; made on first use, then read from the cache."""
-
-    def one(key: Array) -> dict[str, Array]:
-        mine, others = dataset.demonstrate(scene, key), dataset.driven_by_others(scene, key, minds)
-        return jax.vmap(lambda track: scene.features(mine, track))(others.trajectory)
-
-    name = f"{scene.name}-{dataset.fingerprint(scene, count, dataset.TEST)}-{minds.start}-{minds.stop}"
-    file = cache.folder() / "references" / f"{name}.npz"
+def _of_others(scene: Scene, count: int) -> Features:
+    """Features of other experts in the test episodes, two groups of them; made on first use, then read from the cache."""
+    minds = 2 * scene.samples
+    file = cache.folder() / "references" / f"{scene.name}-{dataset.fingerprint(scene, count, dataset.TEST)}-{minds}.npz"
     held = cache.read_arrays(file)
     if held is None:
-        made = dataset.made(jax.jit(jax.vmap(one)), count, dataset.TEST, max(1, AT_ONCE // len(minds)))
-        held = {name: np.asarray(x).swapaxes(0, 1) for name, x in made.items()}
+        mine = dataset.without_truth(dataset.demonstrations(scene, count, dataset.TEST))
+        held = {name: x.swapaxes(0, 1) for name, x in made(scene, mine, minds).items()}
         cache.write_arrays(file, held)
     return held
+
+
+def made(scene: Scene, mine: Demonstration, minds: int) -> Features:
+    """Features of what so many other experts do in the episodes of test demonstrations: (episodes, minds, ...)."""
+
+    def one(held: tuple[Demonstration, Array]) -> dict[str, Array]:
+        demonstration, key = held
+
+        def another(mind: Array) -> dict[str, Array]:
+            return scene.features(demonstration, dataset.driven(scene, demonstration.episode, random.fold_in(key, mind)).trajectory)
+
+        return jax.vmap(another)(jnp.arange(minds))
+
+    keys = random.split(stream("reference", 0), len(jax.tree.leaves(mine)[0]))
+    return in_parts(jax.jit(jax.vmap(one)), (mine, keys), max(1, AT_ONCE // minds))

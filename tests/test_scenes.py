@@ -111,6 +111,7 @@ def test_features_and_metrics_are_finite_and_the_expert_equals_itself(scene):
 
 
 @pytest.mark.parametrize("scene", [DoubleGoal(), Intersection(steps=4, road_users=1)], ids=lambda scene: scene.name)
+@pytest.mark.usefixtures("quick_to_compile")
 def test_agents_are_compared_with_as_many_experts_as_they_have_rollouts(scene, tmp_path, monkeypatch):
     """They are made once, and those of the floor are others."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
