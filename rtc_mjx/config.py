@@ -129,7 +129,16 @@ LEAST = {
     **dict.fromkeys(("model.prior_components", "model.posterior_components"), 1),
     **dict.fromkeys(("batch", "experts.train", "experts.test"), 4),
     **dict.fromkeys(
-        ("first_seed", "losses.adversarial_start", "losses.adversarial_ramp", "losses.type_kl_ramp", "optimiser.discriminator_steps"), 0
+        (
+            "first_seed",
+            "losses.adversarial_start",
+            "losses.adversarial_ramp",
+            "losses.policy_gradient_start",
+            "losses.policy_gradient_ramp",
+            "losses.type_kl_ramp",
+            "optimiser.discriminator_steps",
+        ),
+        0,
     ),
     "model.type_count": 2,
 }
@@ -138,11 +147,24 @@ POSITIVE = (
     "optimiser.learning_rate",
     "optimiser.prior_rate",
     "optimiser.discriminator_rate",
+    "optimiser.value_rate",
     "optimiser.clip",
     "optimiser.trajectory_clip",
 )
 NOT_NEGATIVE = tuple(f"losses.{f.name}" for f in dataclasses.fields(LossWeights) if f.type is float or f.type == "float")
-SHARES = ("encoder_share", "optimiser.final_rate", "optimiser.decay", "scene.lower_probability", "scene.train_share")
+OF_VALUE = (  # read by methods with a V, and by no other
+    *("losses.policy_gradient", "losses.policy_gradient_start", "losses.policy_gradient_ramp", "losses.value"),
+    *("optimiser.value_rate", "optimiser.discount", "optimiser.trace"),
+)
+SHARES = (
+    "encoder_share",
+    "optimiser.final_rate",
+    "optimiser.decay",
+    "optimiser.discount",
+    "optimiser.trace",
+    "scene.lower_probability",
+    "scene.train_share",
+)
 
 
 def configs() -> Path:
@@ -366,6 +388,12 @@ def write(config: Config, folder: Path) -> None:
     write_whole(folder / "config.json", json.dumps(to_dict(config), indent=1) + "\n")
 
 
+def later(method: str) -> frozenset[str]:
+    """Settings that a run may lack since they came later: those its method does not read, and one whose default is what was before."""
+    unread = () if "value" in METHODS[method_name(method)].parts else OF_VALUE
+    return frozenset({"model.posterior_components", *unread})
+
+
 def read(folder: Path) -> Config:
     """The settings of a run directory.
 
@@ -382,7 +410,7 @@ def read(folder: Path) -> Config:
         config = merge(config, {**table, "scene": {}}, str(file))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise error if isinstance(error, UsageError) else UsageError(f"{file} is damaged: {error}") from error
-    absent = [name for name in flat(to_dict(config)) if name not in flat(table)]
+    absent = [name for name in flat(to_dict(config)) if name not in {*flat(table), *later(config.method)}]
     if absent:  # today's default would not be what the run was made with
         raise UsageError(f"{file} lacks {', '.join(absent)}: it is damaged or of another version of rtc_mjx")
     return check(dataclasses.replace(config, run=folder))

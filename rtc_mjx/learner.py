@@ -7,7 +7,8 @@
 
 The policy's networks are held fixed *inside* the simulation loop; the gradient by its outputs at each step, which carries all that a
 step causes later, is applied to the networks afterwards. The sum is the same gradient as going through the loop with them, at
-a fraction of the cost, and each trajectory's share can be inspected before it counts.
+a fraction of the cost, and each trajectory's share can be inspected before it counts. Losses that hold the rollouts fixed (GAIL's) need
+no gradient by them: where a method has no others, the simulation only runs forward.
 
 Rows are agents: an episode with several of them is simulated once and makes a row each (`rtc_mjx.scenes.several`).
 """
@@ -25,9 +26,10 @@ import optax
 from jax import lax, random
 from jaxtyping import Array, Float, Int
 
+from rtc_mjx import credit
 from rtc_mjx.agent_types import SOURCES, Typed, TypeSpace
 from rtc_mjx.keys import stream
-from rtc_mjx.losses import CLOSED_LOOP, LOSSES, Case, LossWeights, gradient_penalty
+from rtc_mjx.losses import CLOSED_LOOP, LOSSES, PATHWISE, Case, LossWeights, gradient_penalty
 from rtc_mjx.methods import Branch, Method
 from rtc_mjx.models import Agent, ModelOptions, Networks, Statistics, make_networks
 from rtc_mjx.physics import OneStep
@@ -47,22 +49,28 @@ class OptimiserOptions:
         prior_rate: Adam's, of the prior; falls alike.
         discriminator_rate: Adam's, of discriminator and Q; constant.
         discriminator_steps: of each trajectory, at random times, that the discriminator learns from in an update; 0 for all.
+        value_rate: Adam's, of GAIL's V; constant.
         final_rate: share of the learning rate left at the last update.
-        clip: largest norm of an update's gradient: of policy and encoder, of the prior, of discriminator and Q.
+        clip: largest norm of an update's gradient: of policy and encoder, of the prior, of discriminator and Q, of V.
         trajectory_clip: largest norm of the gradient of one trajectory's own loss by the policy's outputs.
         gradient: what flows back from step to step of a rollout.
         decay: shrinks the backward signal at each step back in time.
+        discount: of GAIL's rewards, a step.
+        trace: lambda of GAIL's advantage estimation: 0 trusts V after one step, 1 only looks at rewards.
     """
 
     learning_rate: float = 1e-3
     prior_rate: float = 3e-3
     discriminator_rate: float = 1e-3
     discriminator_steps: int = 0
+    value_rate: float = 1e-3
     final_rate: float = 0.1
     clip: float = 1.0
     trajectory_clip: float = 10.0
     gradient: GradientMode = "full"
     decay: float = 1.0
+    discount: float = 0.99
+    trace: float = 0.95
 
 
 @dataclass(frozen=True)
@@ -118,6 +126,11 @@ class Learner:
     def losses(self, branch: Branch) -> tuple[str, ...]:
         """The losses of a branch that the scene has."""
         return tuple(name for name in branch.losses if name != "reconstruction" or self.scene.reconstructs_rollouts)
+
+    @property
+    def pathwise(self) -> bool:
+        """Whether a loss is differentiated through the simulation."""
+        return any(PATHWISE & set(self.losses(b)) for b in self.closed_loop)
 
     def part(self, branch: Branch, batch: Demonstration) -> Demonstration:
         """A branch's episodes of the minibatch, as far as this device has them, a row for each agent."""
@@ -182,7 +195,7 @@ def start_shapes(learner: Learner, seeds: Sequence[int]) -> TrainState:
 
 
 def transformation(learner: Learner) -> optax.GradientTransformation:
-    """Adam with clipping; policy and encoder, prior, discriminator and Q apart."""
+    """Adam with clipping; policy and encoder, prior, discriminator and Q, V apart."""
     options = learner.optimiser
 
     def adam(rate: float | optax.Schedule, b1: float = 0.9) -> optax.GradientTransformation:
@@ -196,7 +209,9 @@ def transformation(learner: Learner) -> optax.GradientTransformation:
         "prior": adam(falling(options.prior_rate)),
         "critic": adam(options.discriminator_rate, b1=0.5),
     }
-    return optax.multi_transform(sides, Networks("agent", "agent", "prior", "critic", "critic"))
+    if "value" in learner.method.parts:  # only then: checkpoints of methods without V hold no place for it
+        sides["value"] = adam(options.value_rate)
+    return optax.multi_transform(sides, Networks("agent", "agent", "prior", "critic", "critic", "value" if "value" in sides else None))
 
 
 def train_step(learner: Learner, state: TrainState, expert: Demonstration) -> tuple[TrainState, dict[str, Array]]:
@@ -236,31 +251,49 @@ def gradients(learner: Learner, networks: Networks, batch: Demonstration, key: A
     now = infer(learner, held, batch, types)
     played, pull = play_together(learner, held, batch, now, play)
 
-    cotangents: Array = jnp.zeros(())
-    guarded: dict[str, Array] = {}
-    if played is not None:
-        alive = played.alive
-
-        def by_rollouts(tracks: Trajectory) -> Array:
-            lost = branch_losses(learner, held, batch, now, Played(tracks, alive), extra, CLOSED_LOOP)
-            return learner.weights.total(lost, update)
-
-        largest, branches = learner.optimiser.trajectory_clip, [learner.size(b) for b in learner.closed_loop]
-        by_outputs = pull(jax.grad(by_rollouts)(played.tracks))
-        cotangents, guarded = guard(by_outputs, alive, branch_sizes(learner), largest, learner.shared, branches)
+    cotangents, guarded = by_outputs(learner, held, batch, now, played, pull, extra, update)
 
     def total(networks: Networks) -> tuple[Array, dict[str, Array]]:
         agent = learner.agent(networks)
         typed = infer(learner, agent, batch, types)
-        lost = branch_losses(learner, agent, batch, typed, played, extra, frozenset(LOSSES))
+        seen = branch_losses(learner, agent, batch, typed, played, extra, frozenset(LOSSES))
+        whole = learner.weights.total(seen, update)
         if played is None:
-            return learner.weights.total(lost, update), lost
-        critic, seen = critic_loss(learner, agent, batch, played, glance)
-        outputs = jax.vmap(agent.policy_outputs)(played.tracks.observations[:, :-1], joined_types(learner, typed))
-        return learner.weights.total(lost, update) + critic + jnp.sum(cotangents * outputs), lost | seen
+            return whole, seen
+        critic, more = critic_loss(learner, agent, batch, played, glance)
+        whole += critic
+        if cotangents is not None:
+            outputs = jax.vmap(agent.policy_outputs)(played.tracks.observations[:, :-1], joined_types(learner, typed))
+            whole += jnp.sum(cotangents * outputs)
+        return whole, seen | more
 
     gradient, report = jax.grad(total, has_aux=True)(networks)
     return learner.shared.total((gradient, report | guarded))
+
+
+def by_outputs(
+    learner: Learner,
+    agent: Agent,
+    batch: Demonstration,
+    typed: list[Typed],
+    played: "Played | None",
+    pull: "Pull | None",
+    key: Array,
+    update: Array,
+) -> tuple[Array | None, dict[str, Array]]:
+    """The guarded gradient by the policy's outputs at each step of the rollouts, None where no loss is pathwise; and what to log of it."""
+    if played is None:
+        return None, {}
+    branches = [learner.size(b) for b in learner.closed_loop]
+    if pull is None:
+        return None, {"trajectories_dropped": jnp.sum(learner.shared.counting(~played.alive, *branches))}
+
+    def by_rollouts(tracks: Trajectory) -> Array:
+        lost = branch_losses(learner, agent, batch, typed, dataclasses.replace(played, tracks=tracks), key, PATHWISE)
+        return learner.weights.total(lost, update)
+
+    gradient = pull(jax.grad(by_rollouts)(played.tracks))
+    return guard(gradient, played.alive, branch_sizes(learner), learner.optimiser.trajectory_clip, learner.shared, branches)
 
 
 def infer(learner: Learner, agent: Agent, batch: Demonstration, key: Array) -> list[Typed]:
@@ -285,24 +318,28 @@ class Played:
     Attributes:
         tracks: trajectories, those that are not finite set to zero.
         alive: which are finite.
+        credit: what each action earned, a `Credit`; None where no loss reads it.
     """
 
     tracks: Any
     alive: Array
+    credit: Any = None
 
 
 Pull = Callable[[Trajectory], Float[Array, "rows steps outputs"]]
 
 
-def play_together(learner: Learner, agent: Agent, batch: Demonstration, typed: list[Typed], key: Array) -> tuple[Played | None, Pull]:
+def play_together(
+    learner: Learner, agent: Agent, batch: Demonstration, typed: list[Typed], key: Array
+) -> tuple[Played | None, Pull | None]:
     """The rollouts of all closed-loop branches, in one simulation; None where there is no such branch.
 
     Returns:
-        The rollouts, and the function from a gradient by them to that by the policy's outputs at each step.
+        The rollouts, and the function from a gradient by them to that by the policy's outputs at each step; None where no loss needs it.
     """
     rows, sizes = [np.arange(learner.batch)[learner.rows(b)] for b in learner.closed_loop], [learner.size(b) for b in learner.closed_loop]
     if not rows:
-        return None, lambda tracks: tracks.actions
+        return None, None
     episodes = learner.shared.mine(jax.tree.map(lambda x: x[np.concatenate(rows)], batch.episode), *sizes)
     g = joined_types(learner, typed)
     keys = learner.keys(key, *sizes)
@@ -311,10 +348,24 @@ def play_together(learner: Learner, agent: Agent, batch: Demonstration, typed: l
         joint = jax.vmap(functools.partial(learner.play, agent))(episodes, *parted(learner.scene, (g, keys, nudge)))
         return merged(learner.scene, jax.vmap(learner.scene.apart)(joint))
 
-    tracks, back = jax.vjp(play, jnp.zeros((len(g), learner.scene.steps, agent.outputs)))
+    tracks, back = (jax.vjp if learner.pathwise else forward)(play, jnp.zeros((len(g), learner.scene.steps, agent.outputs)))
     finite = [jnp.all(jnp.isfinite(x), axis=tuple(range(1, x.ndim))) for x in jax.tree.leaves(tracks)]
     alive = learner.shared.counting(functools.reduce(jnp.logical_and, finite), *sizes)
-    return Played(_only(alive, tracks), alive), lambda gradient: back(gradient)[0]
+    played = credited(learner, agent, Played(_only(alive, tracks), alive), g)
+    return played, None if back is None else lambda gradient: back(gradient)[0]
+
+
+def forward(function: Callable[[Array], Any], x: Array) -> tuple[Any, None]:
+    """In place of `jax.vjp`, where nothing has to come back."""
+    return function(x), None
+
+
+def credited(learner: Learner, agent: Agent, played: Played, types: Array) -> Played:
+    """The rollouts with what each action earned, where the method learns from that."""
+    if agent.networks.value is None:
+        return played
+    each = functools.partial(credit.earned, agent, discount=learner.optimiser.discount, trace=learner.optimiser.trace)
+    return dataclasses.replace(played, credit=credit.standardised(jax.vmap(each)(played.tracks, types), played.alive, learner.shared))
 
 
 def branch_losses(
@@ -333,7 +384,7 @@ def branch_losses(
         if branch.closed_loop:
             part = jax.tree.map(lambda x, a=first, n=count: x[a : a + n], played)
             first += count
-        cases = Case(mine, types, part.tracks, learner.keys(key, learner.size(branch)))
+        cases = Case(mine, types, part.tracks, learner.keys(key, learner.size(branch)), part.credit)
         for name in (n for n in learner.losses(branch) if n in names):
             each = jax.vmap(lambda case, loss=LOSSES[name]: loss(agent, case, learner.weights))(cases)
             counts = part.alive if name in CLOSED_LOOP else learner.shared.counting(jnp.ones(count, bool), learner.size(branch))

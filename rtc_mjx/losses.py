@@ -32,6 +32,10 @@ class LossWeights:
         adversarial: the paper's lambda.
         adversarial_start: updates before lambda begins to rise; the discriminator learns from the first one on.
         adversarial_ramp: updates over which lambda then rises linearly from zero.
+        policy_gradient: of GAIL's score function, whose advantages are standardised.
+        policy_gradient_start: updates before that begins to rise.
+        policy_gradient_ramp: updates over which it then rises linearly from zero.
+        value: of what GAIL's V expects.
         type_kl: the paper's beta.
         type_kl_ramp: updates over which beta rises linearly from zero.
         type_info: InfoMGAIL's mutual-information term.
@@ -45,6 +49,10 @@ class LossWeights:
     adversarial: float = 0.3
     adversarial_start: int = 0
     adversarial_ramp: int = 1000
+    policy_gradient: float = 1.0
+    policy_gradient_start: int = 0
+    policy_gradient_ramp: int = 1000
+    value: float = 1.0
     type_kl: float = 0.01
     type_kl_ramp: int = 0
     type_info: float = 0.1
@@ -71,12 +79,14 @@ class Case:
         typed: g and where it came from.
         rollout: tau_hat, a `Trajectory`; None where no loss of the branch reads it.
         key: for losses that draw.
+        credit: what the rollout's actions earned, a `Credit`; None where no method reads it.
     """
 
     demonstration: Demonstration
     typed: Typed
     rollout: Any
     key: Array
+    credit: Any = None
 
 
 Loss = Callable[[Agent, Case, LossWeights], Array]
@@ -105,6 +115,22 @@ def adversarial(agent: Agent, case: Case, weights: LossWeights) -> Array:
     return jnp.mean(jax.nn.softplus(-logit))
 
 
+def policy_gradient(agent: Agent, case: Case, weights: LossWeights) -> Array:
+    """-mean_t A_t log pi(a_t | s_t, g) on the rollout: its expected gradient is that of minus the mean reward (Williams, 1992).
+
+    Only log pi is differentiated: what was done, what came of it and what that was worth are facts.
+    """
+    track = lax.stop_gradient(case.rollout)  # tau_hat fixed: nothing flows through the simulator
+    outputs = agent.policy_outputs(track.observations[:-1], case.typed.agent_type)
+    return -jnp.mean(lax.stop_gradient(case.credit.advantages) * agent.action_distribution(outputs).log_prob(track.actions))
+
+
+def value(agent: Agent, case: Case, weights: LossWeights) -> Array:
+    """mean_t (V(s_t, g) - target_t)^2: V learns what the policy's rollouts earn from each step on."""
+    seen, g = lax.stop_gradient((case.rollout.observations, case.typed.agent_type))  # only V learns from it
+    return jnp.mean((agent.value(seen, g)[:-1] - lax.stop_gradient(case.credit.targets)) ** 2)
+
+
 def type_kl(agent: Agent, case: Case, weights: LossWeights) -> Array:
     """L_kl: KL[e(g|tau) || p(g)], whose minimiser over p is the marginal of the encoder; or the paper's literal KL[p || e]."""
     prior, posterior = agent.prior(case.demonstration.trajectory.observations[0]), case.typed.posterior
@@ -128,11 +154,14 @@ LOSSES: dict[str, Loss] = {
     "cloning": cloning,
     "reconstruction": reconstruction,
     "adversarial": adversarial,
+    "policy_gradient": policy_gradient,
+    "value": value,
     "type_kl": type_kl,
     "type_info": type_info,
     "type_nll": type_nll,
 }
-CLOSED_LOOP = frozenset({"adversarial", "type_info", "reconstruction"})  # losses that read the rollout
+PATHWISE = frozenset({"adversarial", "type_info", "reconstruction"})  # losses that are differentiated through the rollout
+CLOSED_LOOP = PATHWISE | {"policy_gradient", "value"}  # losses that read the rollout
 
 
 def gradient_penalty(agent: Agent, observations: Array, actions: Array) -> Array:

@@ -59,7 +59,7 @@ class Method:
     def parts(self) -> frozenset[str]:
         """The networks it has beside the policy."""
         by_source = {"encoder": {"encoder", "prior"}, "prior": {"prior"}, "inference": {"inference"}, "label": {"prior"}}
-        by_loss = {"adversarial": {"discriminator"}}
+        by_loss = {"adversarial": {"discriminator"}, "policy_gradient": {"discriminator", "value"}}
         used = [by_source.get(b.types, set()) for b in self.branches] + [by_loss.get(x, set()) for b in self.branches for x in b.losses]
         return frozenset().union(*used)
 
@@ -88,6 +88,7 @@ CLONE, PLAY = ("cloning",), ("adversarial",)
 ENCODED = ("cloning", "reconstruction", "type_kl", "adversarial")
 
 BC = Method((Branch("none", CLONE),))
+GAIL = Method((Branch("none", (*CLONE, "policy_gradient", "value")),))
 MGAIL = Method((Branch("none", CLONE + PLAY),))
 INFO_MGAIL = Method((Branch("inference", CLONE), Branch("fixed_prior", (*PLAY, "type_info"))), test_types="fixed_prior")
 SYMPHONY = Method((Branch("label", (*CLONE, *PLAY, "type_nll")),), kind="label", test_types="prior")
@@ -96,6 +97,7 @@ RTC = Method((Branch("encoder", ENCODED, "encoder_share"), Branch("prior", PLAY,
 
 METHODS: Mapping[str, Method] = {
     "bc": BC,
+    "gail": GAIL,
     "mgail": MGAIL,
     "info_mgail_c": replace(INFO_MGAIL, kind="continuous"),
     "info_mgail_d": replace(INFO_MGAIL, kind="discrete"),

@@ -1,4 +1,4 @@
-"""The agent's networks: policy pi(a|s,g), encoder e(g|tau), prior p(g), discriminator D(s,a) and InfoMGAIL's Q(g|s,a).
+"""The agent's networks: policy pi(a|s,g), encoder e(g|tau), prior p(g), discriminator D(s,a), Q(g|s,a) of InfoMGAIL, V(s,g) of GAIL.
 
 `Agent` bundles the networks (`rtc_mjx.networks`) with what is not learned (input statistics, the type space, the scene) and gives
 each the name that the losses use. All functions take one trajectory or one step.
@@ -64,6 +64,7 @@ class Networks:
         prior: outputs that parametrise p(g).
         discriminator: (s, a) -> logit of "this is the expert".
         inference: (s, a) -> outputs that parametrise Q(g|s,a).
+        value: (s, g, share of the episode that is left) -> mean reward from here on.
     """
 
     policy: Any
@@ -71,6 +72,7 @@ class Networks:
     prior: Any
     discriminator: Any
     inference: Any
+    value: Any = None
 
 
 @pytree
@@ -119,18 +121,8 @@ class Agent:
         return Actor((), Partial(act, agent_type), (jax.vmap(draw)(jax.random.split(key, self.scene.steps)), nudge))
 
     def policy_outputs(self, observation: Array, agent_type: Array) -> Array:
-        """The policy network on one observation in the scene's units, or on an array of them, and a type.
-
-        A type that points at an item of the observation's first set is shown as one more number of each of these items.
-        """
-        seen, kind = self._seen(observation), jnp.broadcast_to(agent_type, (*observation.shape[:-1], self.space.size))
-        if not self.space.points:
-            return self.networks.policy(jnp.concatenate([seen, kind], axis=-1))
-        layout = observation_layout(self.scene, seen.shape[-1])
-        own, (first, *rest) = layout.parts(seen)
-        marked = jnp.concatenate([first, kind[..., None]], axis=-1)
-        flat = [x.reshape(*own.shape[:-1], -1) for x in (own, marked, *rest)]
-        return self.networks.policy(jnp.concatenate(flat, axis=-1))
+        """The policy network on one observation in the scene's units, or on an array of them, and a type."""
+        return self.networks.policy(self._seen_as(observation, agent_type))
 
     def action_distribution(self, outputs: Array) -> GaussianMixture:
         """pi(a|s,g) from the policy's outputs, which are in the scene's units: a mixture of Gaussians in the actuators' units."""
@@ -156,6 +148,11 @@ class Agent:
         """Outputs that parametrise Q(g|s,a)."""
         return self.networks.inference(self.pair(observation, action))
 
+    def value(self, observations: Float[Array, "steps_and_one features"], agent_type: Array) -> Float[Array, "steps_and_one"]:
+        """The mean reward from each time of an episode on, as V expects it."""
+        left = jnp.linspace(1.0, 0.0, len(observations))[:, None]  # not the policy's to see: a baseline may know more
+        return self.networks.value(jnp.concatenate([self._seen_as(observations, agent_type), left], axis=-1))[..., 0]
+
     def pair(self, observation: Array, action: Array) -> Array:
         """A standardised state-action pair, as the discriminator reads it."""
         return jnp.concatenate([self._seen(observation), self._done(action)], axis=-1)
@@ -167,6 +164,19 @@ class Agent:
         own, items = observation_layout(self.scene, observation.shape[-1]).parts(standard)
         there = [jnp.where(x[..., :1] > 0.5, x, 0.0).reshape(*own.shape[:-1], -1) for x in items]  # an item that is not there says nothing
         return jnp.concatenate([own, *there], axis=-1)
+
+    def _seen_as(self, observation: Array, agent_type: Array) -> Array:
+        """What policy and V read of observations and a type.
+
+        A type that points at an item of the observation's first set is shown as one more number of each of these items.
+        """
+        seen, kind = self._seen(observation), jnp.broadcast_to(agent_type, (*observation.shape[:-1], self.space.size))
+        if not self.space.points:
+            return jnp.concatenate([seen, kind], axis=-1)
+        layout = observation_layout(self.scene, seen.shape[-1])
+        own, (first, *rest) = layout.parts(seen)
+        marked = jnp.concatenate([first, kind[..., None]], axis=-1)
+        return jnp.concatenate([x.reshape(*own.shape[:-1], -1) for x in (own, marked, *rest)], axis=-1)
 
     def _done(self, action: Array) -> Array:
         return (action - self.statistics.action_mean) / self.statistics.action_scale
@@ -197,5 +207,6 @@ def make_networks(key: Array, scene: Scene, features: int, space: TypeSpace, opt
         "prior": lambda: Scores(alone, width, rngs) if space.points else jax.random.normal(rngs(), (space.prior_outputs,)),
         "discriminator": lambda: Reader(pair, [options.discriminator_width] * options.depth, 1, rngs),
         "inference": lambda: Reader(pair, hidden, space.inference_outputs, rngs),
+        "value": lambda: Reader(dataclasses.replace(typed, extra=typed.extra + 1), hidden, 1, rngs),
     }
     return Networks(**{name: build() if name in parts | {"policy"} else None for name, build in builders.items()})

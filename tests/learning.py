@@ -18,6 +18,7 @@ SCENE = DoubleGoal(steps=16)
 MODEL = ModelOptions(width=16, type_size=3, type_count=4, prior_components=3)
 ON_SCENE = tuple(name for name, method in METHODS.items() if method.kind != "label" or SCENE.labels)
 CLOSED_LOOP = tuple(name for name in ON_SCENE if any(b.closed_loop for b in METHODS[name].branches))
+SCORED = tuple(name for name in ON_SCENE if "value" in METHODS[name].parts)  # learn by the score function
 OPEN = OptimiserOptions(trajectory_clip=1e9)
 
 

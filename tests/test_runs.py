@@ -466,3 +466,19 @@ def test_settings_that_lack_a_key_are_not_completed_with_todays_defaults(tmp_pat
     (tmp_path / "config.json").write_text(json.dumps(table))
     with pytest.raises(UsageError, match="lacks losses.type_kl"):
         config.read(tmp_path)
+
+
+@pytest.mark.parametrize("method", ON_SCENE)
+def test_a_run_may_lack_later_settings_that_its_method_does_not_read(method, tmp_path):
+    held = settings(method)
+    config.write(held, tmp_path)
+    table = json.loads((tmp_path / "config.json").read_text())
+    for name in config.OF_VALUE:
+        section, key = name.split(".")
+        del table[section][key]
+    (tmp_path / "config.json").write_text(json.dumps(table))
+    if method == "gail":
+        with pytest.raises(UsageError, match="lacks losses.policy_gradient"):
+            config.read(tmp_path)
+    else:
+        assert config.read(tmp_path) == dataclasses.replace(held, run=tmp_path)

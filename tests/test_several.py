@@ -193,7 +193,7 @@ def test_a_training_of_two_cars_goes_on_to_the_same_numbers_and_is_tested_and_fi
     assert len({render.colour(actor, agent, 2) for actor in (1, 2) for agent in (0, 1)}) == 4
 
 
-@pytest.mark.parametrize("method", ["symphony", "info_mgail_c", "bc"])
+@pytest.mark.parametrize("method", ["symphony", "info_mgail_c", "gail", "bc"])
 def test_every_kind_of_method_takes_several_agents(method):
     """Traced, not run: shapes fit, and every agent has a type."""
     held = settings(None, method=method)
