@@ -13,7 +13,6 @@ from jax import random
 from made import made, recordings
 
 from rtc_mjx import config, dataset, evaluate, inverse_dynamics, train
-from rtc_mjx.challenge import at_log_rate
 from rtc_mjx.config import Config
 from rtc_mjx.errors import UsageError
 from rtc_mjx.inverse_dynamics import FitOptions, fit, start_of
@@ -22,6 +21,7 @@ from rtc_mjx.logs.convert import Options
 from rtc_mjx.logs.store import scenes
 from rtc_mjx.methods import METHODS
 from rtc_mjx.physics import rest_surroundings, simulate, specialised_step
+from rtc_mjx.realism import at_log_rate
 from rtc_mjx.runs import RECORDINGS
 from rtc_mjx.scenes.recorded import FOLLOWED, HEADED, Recorded, fitted, part_of
 from rtc_mjx.scenes.recorded import driven as logged
