@@ -100,6 +100,9 @@ def test_who_cannot_be_scored_is_told():
     made = womd.read(scenario().SerializeToString(), "made")
     with pytest.raises(UsageError, match="made: it does not say which car drove itself"):
         of_recording(dataclasses.replace(made, sdc=-1, to_predict=None))
+    for now in (-1, 91):
+        with pytest.raises(UsageError, match=f"made: its current time is number {now}; it has 91 times"):
+            of_recording(dataclasses.replace(made, now=now))
     valid = made.tracks.valid.copy()
     valid[:2, NOW] = False
     with pytest.raises(UsageError, match="none of the agents to score is there"):

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rtc_mjx.logs.convert import HEIGHT
 from rtc_mjx.logs.recording import Recording, Tracks, refuse_if
-from rtc_mjx.logs.road import COLOUR, cleaned, simplified
+from rtc_mjx.logs.road import COLOUR, MOST_LANES, cleaned, simplified
 from rtc_mjx.logs.scene import RATE, RED, VEHICLE
 from rtc_mjx.logs.window import TIMES, cut
 from rtc_mjx.sim_agents.inputs import LoggedAgents, RoadEdges, StopLines
@@ -82,10 +82,13 @@ def of_recording(recording: Recording) -> Task:
     Its current time is the recording's, or 1 s from its start where that is earlier.
 
     Raises:
-        UsageError: it lasts less than 9 s, does not say whom to score, or none of these is there at the current time.
+        UsageError: it lasts less than 9 s, does not say whom to score, none of these is there at the current time, or its current time or
+            map is none.
     """
-    times = recording.times
-    window = cut(recording, max(0.0, float(times[recording.now] - times[0]) - NOW / RATE))
+    times, now, lanes = recording.times, recording.now, len(recording.map.lanes)
+    refuse_if(not 0 <= now < len(times), recording.source, f"its current time is number {now}; it has {len(times)} times")
+    refuse_if(lanes > MOST_LANES, recording.source, f"its map has {lanes} lanes; more than {MOST_LANES} are not scored")
+    window = cut(recording, max(0.0, float(times[now] - times[0]) - NOW / RATE))
     notes = Counter(recording.repairs) + Counter(window.notes)
     tracks, size = window.tracks, _sizes(recording, window.tracks, notes)
     kept = np.flatnonzero(tracks.valid[:, NOW] & np.all(np.isfinite(size), axis=1))
