@@ -23,7 +23,6 @@ from rich.console import Console
 from rich.table import Table
 
 from rtc_mjx import cache, cli, dataset, metrics, reference
-from rtc_mjx.challenge import challenge
 from rtc_mjx.config import Config
 from rtc_mjx.errors import DivergedError, UsageError
 from rtc_mjx.files import write_whole
@@ -33,6 +32,7 @@ from rtc_mjx.methods import Method
 from rtc_mjx.models import Networks
 from rtc_mjx.provenance import made_by, of_recordings
 from rtc_mjx.pytree import in_parts
+from rtc_mjx.recorded_realism import challenge
 from rtc_mjx.runs import Run
 from rtc_mjx.scenes import Features, Recorded
 from rtc_mjx.sharding import ONE_DEVICE, Grid

@@ -13,7 +13,6 @@ from jax import random
 from made import made, recordings
 
 from rtc_mjx import config, data, dataset, evaluate, inverse_dynamics, reference, train
-from rtc_mjx.challenge import at_log_rate
 from rtc_mjx.config import Config
 from rtc_mjx.errors import UsageError
 from rtc_mjx.inverse_dynamics import Fit, FitOptions, fit, start_of
@@ -23,6 +22,7 @@ from rtc_mjx.logs.convert import Options
 from rtc_mjx.logs.store import scenes
 from rtc_mjx.methods import METHODS
 from rtc_mjx.physics import rest_surroundings, simulate, specialised_step
+from rtc_mjx.recorded_realism import at_log_rate
 from rtc_mjx.runs import RECORDINGS
 from rtc_mjx.scenes import pool
 from rtc_mjx.scenes import recorded as recorded_scenes

@@ -270,11 +270,11 @@ def test_weights_of_the_meta_metric_sum_to_one():
     assert sum(estimate.weight for estimate in ESTIMATES.values()) == pytest.approx(1.0)
 
 
-def realism(log, rollouts, scored, edges, lines, present=None):
+def realism(log, rollouts, scored, edges, lines, present=None, size=None):
     """Its figures; all scenes here have one shape, filled up with nobody, so that it is compiled once."""
     scored = jnp.concatenate([jnp.asarray(scored), jnp.full(3 - len(scored), -1)])
     present = jnp.ones((log.valid.shape[0], FUTURE), bool) if present is None else present
-    return jax.device_get(compiled(log, rollouts, scored, edges, lines, present))
+    return jax.device_get(compiled(log, rollouts, scored, edges, lines, present, log.size if size is None else size))
 
 
 # Whole scenes --------------------------------------------------------------------------------------------------------
@@ -400,6 +400,47 @@ def test_what_cannot_be_scored_is_left_out_of_the_mean():
     weights = [ESTIMATES[name].weight for name in left]
     values = [float(found[f"{name}_likelihood"]) for name in left]
     assert float(found["realism_meta_metric"]) == pytest.approx(np.average(values, weights=weights))
+
+
+def test_the_last_times_of_a_rollout_count_in_the_last_bin_of_speeds_and_accelerations():
+    """At 3 m/s straight on, 6 rollouts like the log: of 12 times the last has no speed, and the last two have no acceleration."""
+    log, _, _, edges, lines = scene()
+    clock = jnp.arange(HISTORY + FUTURE) / 10
+    straight = dataclasses.replace(log, pose=log.pose.at[0].set(poses(3 * clock, -3.0, 0.75)))
+    found = realism(straight, jnp.repeat(straight.pose[None, :, HISTORY:], 6, axis=0), [0], edges, lines)
+    assert float(found["linear_speed_likelihood"]) == pytest.approx((6 * 11 + 0.1) / (6 * 12 + 10 * 0.1), rel=1e-5)
+    assert float(found["angular_speed_likelihood"]) == pytest.approx((6 * 11 + 0.1) / (6 * 12 + 11 * 0.1), rel=1e-5)
+    for name in ("linear", "angular"):
+        assert float(found[f"{name}_acceleration_likelihood"]) == pytest.approx((6 * 10 + 0.1) / (6 * 12 + 11 * 0.1), rel=1e-5)
+
+
+def test_who_is_no_vehicle_counts_as_somebody_who_never_runs_a_red():
+    """The first car runs a red in the log and stands in all 6 rollouts; the pedestrian counts as well."""
+    log, _, _, edges, lines = scene()
+    standing = jnp.tile(log.pose[None, :, HISTORY - 1 : HISTORY], (6, 1, FUTURE, 1))
+    found = {len(scored): realism(log, standing, scored, edges, lines) for scored in ([0], [0, 4])}
+    runs, never = 0.001 / 6.002, 6.001 / 6.002
+    assert float(found[1]["traffic_light_violation_likelihood"]) == pytest.approx(runs, rel=1e-4)
+    assert float(found[2]["traffic_light_violation_likelihood"]) == pytest.approx((runs * never) ** 0.5, rel=1e-4)
+
+
+def test_who_is_scored_and_leaves_the_log_counts_as_somebody_whom_nothing_happens_to():
+    """The second scored agent is gone after the current time; in one rollout of six the first one leaves the road."""
+    log, _, _, edges, lines = scene()
+    gone = dataclasses.replace(log, valid=log.valid.at[2, HISTORY:].set(False))
+    rollouts = jnp.repeat(log.pose[None, :, HISTORY:], 6, axis=0).at[1, 0, 5, 1].set(-30.0)
+    found = realism(gone, rollouts, [0, 2], edges, lines)
+    stays, nothing = 5.001 / 6.002, 6.001 / 6.002
+    assert float(found["offroad_likelihood"]) == pytest.approx((stays * nothing) ** 0.5, rel=1e-4)
+    assert float(found["simulated_offroad_rate"]) == pytest.approx(1 / 12)
+
+
+def test_what_drives_in_the_rollouts_may_have_another_size_than_in_the_log():
+    log, _, _, edges, lines = scene()
+    rollouts = jnp.repeat(log.pose[None, :, HISTORY:], 6, axis=0)
+    long = realism(log, rollouts, [0], edges, lines, size=log.size.at[0, 0].set(40.0))
+    assert float(long["simulated_collision_rate"]) == 1  # with who drives before it
+    assert float(long["collision_likelihood"]) == pytest.approx(0.001 / 6.002, rel=1e-3)  # the log's car is as long as it was
 
 
 def test_rates_are_over_rollouts_and_agents():

@@ -137,7 +137,8 @@ def _binary_kind(file: Path) -> Foreign:
     """A bare protocol buffer, such as a Sim Agents submission, or nothing we know."""
     data = file.read_bytes() if file.stat().st_size < LARGEST else b""
     if data and _parses(messages.Anything, data) is not None:
-        return Foreign("a protocol buffer on its own, not in a TFRecord (such as a Sim Agents submission)", True)
+        what = "a protocol buffer on its own, not in a TFRecord (a Sim Agents submission is scored by python -m rtc_mjx.challenge)"
+        return Foreign(what, True)
     return Foreign("none of them (or damaged at its start)", False)
 
 

@@ -2,6 +2,11 @@
 
 from rtc_mjx.sim_agents.features import features
 from rtc_mjx.sim_agents.inputs import LoggedAgents, RoadEdges, StopLines, stop_lines
+from rtc_mjx.sim_agents.recorded import Task, of_recording
 from rtc_mjx.sim_agents.score import ESTIMATES, realism
+from rtc_mjx.sim_agents.submission import Rollouts, places, rollouts
 
-__all__ = ["ESTIMATES", "LoggedAgents", "RoadEdges", "StopLines", "features", "realism", "stop_lines"]
+__all__ = [
+    "ESTIMATES", "LoggedAgents", "RoadEdges", "Rollouts", "StopLines", "Task", "features", "of_recording", "places", "realism",
+    "rollouts", "stop_lines",
+]  # fmt: skip

@@ -14,7 +14,7 @@ class LoggedAgents:
     Attributes:
         pose: x, y, z in m, of the centre, and heading in rad.
         valid: when each is there. Who is not there at the current time is not simulated and counts for nothing.
-        size: length, width, height in m, at the current time; log and simulation are both scored with it.
+        size: length, width, height in m, at the current time.
         vehicle: which are vehicles: time to collision and red lights are scored for these only.
     """
 
@@ -43,7 +43,7 @@ class StopLines:
 
     Attributes:
         lanes: centre lines in m; after its last point a lane repeats it. A lane that is not there has all points alike.
-        stop: where to stop for each lane's signal, m.
+        stop: where to stop for each lane's signal, m; any point where it has none.
         red: when each lane's signal says stop, at the times of the log. A lane without a signal is never red.
     """
 
@@ -53,5 +53,8 @@ class StopLines:
 
 
 def stop_lines(scene: LoggedScene) -> StopLines:
-    """Those of a logged scene: one stops before the start of a lane whose signal is red."""
+    """Those of a logged scene, which keeps no stop points: one stops before the start of a lane whose signal is red.
+
+    Recordings of the Waymo Open Motion Dataset have their stop points there; `recorded.of_recording` takes them as logged.
+    """
     return StopLines(scene.road.lanes, scene.road.lanes[:, 0], jnp.asarray(scene.signals == RED))

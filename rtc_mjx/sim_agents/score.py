@@ -34,6 +34,8 @@ MAP_BASED = {
 }
 ESTIMATES = KINEMATIC | INTERACTIVE | MAP_BASED
 INDICATORS = ("collision", "offroad", "traffic_light_violation")
+SPEEDS, ACCELERATIONS = 1, 2  # times at the end of a rollout that have no difference
+UNDIFFERENCED = dict(zip(KINEMATIC, (SPEEDS, ACCELERATIONS, SPEEDS, ACCELERATIONS), strict=True))
 
 
 def realism(
@@ -43,6 +45,7 @@ def realism(
     edges: RoadEdges,
     lines: StopLines | None = None,
     present: Bool[Array, "agents future"] | None = None,
+    size: Float[Array, "agents 3"] | None = None,
 ) -> dict[str, Float[Array, ""]]:
     """All figures of one scene. Rates are over (rollout, agent), displacements in m, the rest in [0, 1].
 
@@ -62,6 +65,7 @@ def realism(
         lines: stop lines; without them red lights are not scored.
         present: when the rollouts have each agent; in the challenge, and where not given, always. A replay has who the log has: the log
             itself scores `realism(log, log.pose[None, :, -future:], scored, edges, lines, log.valid[:, -future:])`.
+        size: length, width, height in m of the agents as simulated; those of the log where not given, as in the challenge.
 
     Raises:
         UsageError: shapes that do not belong together.
@@ -72,15 +76,18 @@ def realism(
     logged, held = log.valid & there, jnp.repeat(there, future, axis=1)
     simulated = jnp.concatenate([logged[:, :-future], held if present is None else held & present], axis=1)
 
-    def of(pose: Array, valid: Array) -> dict[str, Array]:
-        return features(pose, valid, log.size, scored, edges, lines, future=future)
+    def of(pose: Array, valid: Array, size: Array) -> dict[str, Array]:
+        return features(pose, valid, size, scored, edges, lines, future=future)
 
-    ours = of(log.pose, logged)
-    theirs = lax.map(lambda pose: of(jnp.concatenate([log.pose[:, :-future], pose], axis=1), simulated), rollouts)
+    boxes, before = log.size if size is None else size, log.pose[:, :-future]
+    ours = of(log.pose, logged, log.size)
+    theirs = lax.map(lambda pose: of(jnp.concatenate([before, pose], axis=1), simulated, boxes), rollouts)
     chosen = logged[scored] & (scored >= 0)[:, None]
+    judged = chosen[:, -future - 1]
     counts = _counts(chosen[:, -future:], log.vehicle[scored], edges, lines)
     known = {name: where[:, -future:] for name, where in _by_differences(simulated[scored]).items()}
-    likelihoods = _likelihoods(ours, theirs, counts, known)
+    theirs, known = _with_ends(theirs, known, simulated[scored, -future:])
+    likelihoods = _likelihoods(ours, theirs, counts, known, _judged(judged, edges, lines))
     return {
         **{f"{name}_likelihood": value for name, value in likelihoods.items()},
         "realism_meta_metric": _weighted(likelihoods, ESTIMATES),
@@ -88,7 +95,7 @@ def realism(
         "interactive": _weighted(likelihoods, INTERACTIVE),
         "map_based": _weighted(likelihoods, MAP_BASED),
         **_displacements(log.pose[scored], rollouts[:, scored], chosen & simulated[scored]),
-        **{f"simulated_{name}_rate": _rate(theirs[name], chosen[:, -future:]) for name in INDICATORS},
+        **{f"simulated_{name}_rate": _rate(theirs[name] & chosen[:, -future:], judged) for name in INDICATORS},
     }
 
 
@@ -118,6 +125,11 @@ def _counts(valid: Array, vehicle: Bool[Array, "scored"], edges: RoadEdges, line
     }
 
 
+def _judged(scored: Bool[Array, "scored"], edges: RoadEdges, lines: StopLines | None) -> dict[str, Array]:
+    """Whose indicators count: everybody's who is scored, where there is what they are told by."""
+    return {"collision": scored, "offroad": scored & jnp.any(edges.valid), "traffic_light_violation": scored & (lines is not None)}
+
+
 def _by_differences(valid: Bool[Array, "scored times"]) -> dict[str, Array]:
     """Where each feature has a value: where the agent is there, or for differences its neighbours in time are."""
     speed = differenced(valid)
@@ -126,14 +138,29 @@ def _by_differences(valid: Bool[Array, "scored times"]) -> dict[str, Array]:
     return dict.fromkeys(ESTIMATES, valid) | kinematic
 
 
-def _likelihoods(ours: dict[str, Array], theirs: dict[str, Array], counts: dict[str, Array], known: dict[str, Array]) -> dict[str, Array]:
-    """The likelihood of each feature of the log; indicators are first gathered over time."""
+def _with_ends(
+    theirs: dict[str, Array], known: dict[str, Array], there: Bool[Array, "scored future"]
+) -> tuple[dict[str, Array], dict[str, Array]]:
+    """The last times of a rollout have no difference and count in the last bin: there the public code's not-a-number goes."""
+    ended = {name: theirs[name].at[..., -last:].set(ESTIMATES[name].high) for name, last in UNDIFFERENCED.items()}
+    seen = {name: known[name].at[:, -last:].set(there[:, -last:]) for name, last in UNDIFFERENCED.items()}
+    return theirs | ended, known | seen
+
+
+def _likelihoods(
+    ours: dict[str, Array], theirs: dict[str, Array], counts: dict[str, Array], known: dict[str, Array], judged: dict[str, Array]
+) -> dict[str, Array]:
+    """The likelihood of each feature of the log.
+
+    Indicators are first gathered over the times that count, and then count for every scored agent, as in the challenge: also for who is
+    no vehicle and cannot run a red.
+    """
     out = {}
     for name, estimate in ESTIMATES.items():
         log, rollouts, held, seen = ours[name], theirs[name], counts[name], known[name]
         if name in INDICATORS:
             log, rollouts = (jnp.any(x & held, axis=-1, keepdims=True) for x in (log, rollouts))
-            held, seen = jnp.any(held, axis=-1, keepdims=True), jnp.ones_like(seen[:, -1:])
+            held, seen = judged[name][:, None], jnp.ones_like(seen[:, -1:])
         out[name] = likelihood(estimate, 1.0 * log, 1.0 * rollouts, jnp.broadcast_to(seen, rollouts.shape), held)
     return out
 
@@ -157,7 +184,6 @@ def _displacements(log: Float[Array, "scored times 4"], rollouts: Array, counts:
     return {"average_displacement_error": jnp.mean(mean), "min_average_displacement_error": jnp.min(mean)}
 
 
-def _rate(happens: Bool[Array, "rollouts scored future"], counts: Bool[Array, "scored future"]) -> Float[Array, ""]:
-    """Share of (rollout, agent) it happens to at any time at which the log has the agent."""
-    agents = jnp.any(counts, axis=1)
-    return jnp.sum(jnp.any(happens & counts, axis=-1) & agents) / (happens.shape[0] * jnp.sum(agents))
+def _rate(happens: Bool[Array, "rollouts scored future"], judged: Bool[Array, "scored"]) -> Float[Array, ""]:
+    """Share of (rollout, scored agent) it happens to at any time."""
+    return jnp.sum(jnp.any(happens, axis=-1) & judged) / (happens.shape[0] * jnp.sum(judged))
