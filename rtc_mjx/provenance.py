@@ -15,7 +15,8 @@ PACKAGES = ("mujoco", "mujoco-mjx", "jax", "flax", "optax")  # that a result nam
 MEASURING = (
     "evaluate.py",
     "metrics.py",
-    "challenge.py",
+    "reference.py",
+    "recorded_realism.py",
     "type_shift.py",
     "carried.py",
     "realism.py",
