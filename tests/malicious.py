@@ -180,7 +180,7 @@ def records() -> dict[str, bytes]:
     """TFRecords of messages that claim much in few bytes."""
     held = scenario().SerializeToString()
     many = {"tracks": b"\x12\x00", "features": b"\x42\x00", "times": b"\x3a\x00", "to predict": b"\x5a\x00", "of interest": b"\x20\x01"}
-    out = {f"many {what}": held + empty * 3_000_000 for what, empty in many.items()}
+    out = {f"many {what}": held + empty * 1_000_000 for what, empty in many.items()}
     wide = features() | {"traffic_light_state/current/state": np.ones(10**6, int)}
     one = b"\x0a\x02\x12\x00" + b"\x0a\x04\x0a\x00\x12\x00" * 10
     out |= {"lights of no light": example(wide), "empty features": example(features()) + one * 30_000}

@@ -14,6 +14,7 @@ from rtc_mjx.logs.recording import (
     MOST_LINKS,
     MOST_POINTS,
     MOST_SIGNALS,
+    MOST_TRACKS,
     MPH,
     OTHER,
     SIGNAL_STATES,
@@ -83,6 +84,7 @@ def parsed(message: Any, payload: bytes, source: str) -> Any:
 
 
 def _tracks(logged: Any, times: int, source: str, repairs: Counter[str]) -> Tracks:
+    refuse_if(len(logged) > MOST_TRACKS, source, f"it claims {len(logged)} tracks; more than {MOST_TRACKS} are not read")
     out = empty_tracks(tuple(str(t.id) for t in logged), times, source)
     again = [known for known, count in Counter(out.ids).items() if count > 1]
     refuse_if(bool(again), source, f"it has several tracks with the ids {again[:5]}; each road user has one of its own")
