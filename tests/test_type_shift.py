@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from jax.tree_util import Partial
 from learning import SCENE, learner, settings
-from made import recordings
 from matplotlib.figure import Figure
 
 from rtc_mjx import carried, config, dataset, evaluate, probe, shift_report, type_shift
@@ -278,26 +277,6 @@ def test_the_analysis_of_types_says_what_is_there_to_say(method, tmp_path):
         type_shift.main(["--run", str(run.folder), "--probe", "8"])
     with pytest.raises(UsageError, match="--episodes 3"):
         type_shift.main(["--run", str(run.folder), "--episodes", "3"])
-
-
-@pytest.mark.usefixtures("quick_probe", "quick_to_compile")
-def test_several_cars_with_labels_are_analysed(tmp_path):
-    few = ("--scene.steps", "6", "--scene.road-users", "2", "--scene.controlled", "2")
-    result = analysed(untrained(tmp_path / "run", *few, scene="intersection", method="symphony"), "--episodes", "8")
-    check_types(result, 2 * 8, result["metric"])
-    assert set(result["types"]) == {"prior", "paired", "same_xi", "shuffled"} and set(result["information"]) == {"xi", "mind"}
-    assert set(result["realism"]["features"]) == {"collision", "offroad", "progress", "curvature", "decided", "ran_red"}
-    assert set(result["reaction"]) == {"prior", "paired", "shuffled", "expert"}
-    assert result["reencoding"]["demonstration"][0] >= 0  # a label is at least as sure of itself as the prior
-
-
-@pytest.mark.usefixtures("quick_probe", "quick_to_compile")
-def test_recorded_scenes_are_analysed_as_far_as_they_go(tmp_path):
-    few = ("--scene.steps", "6", "--scene.road-users", "4", "--scene.data", recordings("scenarionet_waymo"))
-    result = analysed(untrained(tmp_path / "run", *few, scene="womd", method="rtc_c"), "--episodes", "4")
-    check_types(result, 4, result["metric"])
-    assert set(result["types"]) == {"prior", "paired", "shuffled"} and "reaction" not in result
-    assert set(result["left_out"]) >= {"realism"} and "mind" not in result.get("information", {})
 
 
 def test_a_figure_holds_several_runs_and_leaves_out_what_none_has():
