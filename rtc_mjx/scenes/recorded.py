@@ -94,7 +94,8 @@ class Recorded(Driving):
             raise UsageError(f"--scene.steps {self.steps}: recorded scenes last 9 s, at most 30 steps")
         if self.most < len(PARTS):
             raise UsageError(f"--scene.most {self.most}: at least {len(PARTS)} are needed")
-        found = tuple(listed([self.data], self.options))
+        with jax.ensure_compile_time_eval():  # recordings may be asked for first while a program is traced
+            found = tuple(listed([self.data], self.options))
         if not any(held.scenes for held in found):
             raise UsageError(none_of([self.data], self.options))
         return found
@@ -159,7 +160,8 @@ class Recorded(Driving):
         Raises:
             UsageError: there is none.
         """
-        return _pool(self, part)
+        with jax.ensure_compile_time_eval():  # recordings may be asked for first while a program is traced
+            return _pool(self, part)
 
     def recorded(self, part: Part, count: int) -> Episode:
         """So many of the recorded episodes of a part, the first of its pool (all, if there are fewer), with a leading axis."""
