@@ -177,8 +177,8 @@ class Replays:
 
 
 def _pooled(errors: dict[str, np.ndarray], moving: np.ndarray) -> Table:
-    """Over all positions after the first of agents that move, whosever they are."""
-    out = Table("scenes", "of", "median", "95 %", title=f"all positions of agents that get more than {MOVES:g} m away")
+    """Over all positions after the first, whosever they are, of agents that get more than MOVES m away."""
+    out = Table("scenes", "of", "median", "95 %", title="all positions of moving agents")
     for name, error in errors.items():
         held = error[moving, 1:]
         out.add_row(f"{np.sum(moving):,}", name, *(f"{np.quantile(held, share):.3f}" if held.size else "-" for share in (0.5, 0.95)))
