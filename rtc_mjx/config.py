@@ -388,10 +388,14 @@ def write(config: Config, folder: Path) -> None:
     write_whole(folder / "config.json", json.dumps(to_dict(config), indent=1) + "\n")
 
 
+def unread(method: str) -> frozenset[str]:
+    """Settings that a method does not read: two runs of it that differ in these are alike."""
+    return frozenset() if "value" in METHODS[method_name(method)].parts else frozenset(OF_VALUE)
+
+
 def later(method: str) -> frozenset[str]:
     """Settings that a run may lack since they came later: those its method does not read, and one whose default is what was before."""
-    unread = () if "value" in METHODS[method_name(method)].parts else OF_VALUE
-    return frozenset({"model.posterior_components", *unread})
+    return unread(method) | {"model.posterior_components"}
 
 
 def read(folder: Path) -> Config:

@@ -66,13 +66,13 @@ def complete(entry: Entry, scene: str, folder: Path, team: Team = ALONE, analyse
 
 
 def check_same(wanted: Config, run: Run) -> None:
-    """That a run has the settings wanted, all of them.
+    """That a run has the settings wanted, all that its method reads.
 
     Raises:
         UsageError: it has not; the first that differs, with both values.
     """
     ours, theirs = (config.flat(config.to_dict(held)) for held in (wanted, run.config))
-    for name in [name for name in ours if ours[name] != theirs.get(name)]:
+    for name in [name for name in ours if ours[name] != theirs.get(name) and name not in config.unread(run.config.method)]:
         option = f"--{name.replace('_', '-')}"
         raise UsageError(
             f"{option} {ours[name]} is wanted: the run in {run.folder} has {theirs.get(name)}; give {option} {theirs.get(name)}, "

@@ -1,5 +1,7 @@
 """The study: verdicts and tests over seeds by hand, studies that are stopped and go on, results that are neither lost nor mixed up."""
 
+import contextlib
+import dataclasses
 import functools
 import json
 import os
@@ -9,6 +11,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -338,6 +341,16 @@ def test_a_finished_run_of_other_settings_is_not_taken_for_the_one_wanted(again,
     with pytest.raises(UsageError, match=named) as caught:
         study.main(command(again, "rtc_c,mgail", *options))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("method", "matters"), [("mgail", False), ("gail", True)])
+def test_settings_that_a_method_does_not_read_do_not_make_another_run_of_it(method, matters):
+    held = config.defaults("double_goal", method)
+    other = dataclasses.replace(held, losses=dataclasses.replace(held.losses, policy_gradient=7.0))
+    run = SimpleNamespace(config=held, folder=Path("run"))
+    entry.check_same(held, run)
+    with pytest.raises(UsageError, match="losses.policy-gradient 7.0 is wanted") if matters else contextlib.nullcontext():
+        entry.check_same(other, run)
 
 
 def test_committed_settings_that_changed_are_seen_too(again, monkeypatch):
