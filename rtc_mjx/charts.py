@@ -249,6 +249,8 @@ def realism(held: Held, file: Path) -> None:
     canvas = Figure(figsize=(2.6 * len(features) + 1.2, 0.36 * len(found) + 1.2), layout="constrained")
     for axis, feature in zip(canvas.subplots(1, len(features), squeeze=False, sharey=True)[0], features, strict=True):
         for place, of in enumerate(found.values()):
+            if feature not in of:
+                continue
             seeds = of[feature]["agent"]
             axis.barh(place, np.mean(seeds), color="0.8", height=0.66)
             axis.plot(seeds, [place] * len(seeds), "k.", markersize=4)

@@ -124,7 +124,8 @@ def conditional_realism(held: Held, study: str) -> str:
     rows = [["method", *(word for feature in features for word in (feature, "floor"))]]
     for name, record in whole.items():
         found = record["type_shift"]["realism"]["features"]
-        rows.append([name, *(w for f in features for w in (number(found[f]["agent"], spread=True), _plain(found[f]["floor"])))])
+        cells = [(number(found[f]["agent"], spread=True), _plain(found[f]["floor"])) if f in found else ("", "") for f in features]
+        rows.append([name, *(word for words in cells for word in words)])
     told = (
         f"JSD in bits between {first['experts']} experts and as many rollouts under prior types in one episode, mean over "
         f"{first['episodes']} episodes. Floor: the same between two groups of experts, in the bins of that row. {OVER_SEEDS}"
