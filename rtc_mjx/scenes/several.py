@@ -56,9 +56,9 @@ def the_others(cars: int) -> Int[np.ndarray, "cars others"]:
 
 def merged(scene: Scene, tree: Any) -> Any:
     """Leading axes (episodes, agents) as one axis of rows: all agents of the first episode, then those of the next."""
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tree) if scene.agents > 1 else tree
+    return jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), tree) if scene.agents > 1 else tree
 
 
 def parted(scene: Scene, rows: Any) -> Any:
     """Rows as leading axes (episodes, agents)."""
-    return jax.tree.map(lambda x: x.reshape(-1, scene.agents, *x.shape[1:]), rows) if scene.agents > 1 else rows
+    return jax.tree.map(lambda x: x.reshape(x.shape[0] // scene.agents, scene.agents, *x.shape[1:]), rows) if scene.agents > 1 else rows
