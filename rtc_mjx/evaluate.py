@@ -156,7 +156,7 @@ def evaluate(run: Run, episodes: int, watch: Watch = iter) -> dict[str, Any]:
             "metrics": means["prior"],
             "types": means,
             "reaction": reaction(learner, functools.partial(roll, networks), shown, features),
-            "ranges": config.scene.ranges(expert),
+            "ranges": {name: list(limits) for name, limits in config.scene.ranges(expert).items()},
             "notes": {what: count for what, count in config.scene.notes(test.episode).items() if count},
             "reference": {"expert": config.scene.metrics(expert, expert), "expert_vs_expert": config.scene.metrics(second, expert)},
         }
@@ -208,7 +208,7 @@ def _summaries(config: Config, features: Features, expert: Features, values: dic
         drawn = [{k: v[i][:, rows] for k, v in features.items()} for i in range(config.seeds)]
         return np.mean([list(config.scene.metrics(d, theirs, ranges).values()) for d in drawn], axis=0)
 
-    low, high = metrics.bootstrap(np.arange(next(iter(expert.values())).shape[1]), means_over_seeds, draws=200)
+    low, high = metrics.bootstrap(np.arange(next(iter(expert.values())).shape[1]), means_over_seeds, draws=200, biased=True)
     out = {}
     for (name, per_seed), *interval in zip(values.items(), low, high, strict=True):
         spread = float(np.std(per_seed, ddof=1)) if len(per_seed) > 1 else 0.0

@@ -29,13 +29,16 @@ def _relative_entropy(p: np.ndarray, q: np.ndarray) -> float:
     return float(np.sum(p[held] * np.log2(p[held] / q[held])))
 
 
-def bootstrap(values: np.ndarray, statistic: Callable[[np.ndarray], Any] = np.mean, *, draws: int = 1000) -> tuple[Any, Any]:
+def bootstrap(
+    values: np.ndarray, statistic: Callable[[np.ndarray], Any] = np.mean, *, draws: int = 1000, biased: bool = False
+) -> tuple[Any, Any]:
     """The 95 % percentile interval of a statistic (a number, or an array of them) over resampled rows of `values`.
 
-    The draws are always the same. Resampling biases some statistics, such as a divergence, upwards: the interval is moved back by the
-    difference between the mean of the draws and the statistic itself.
+    The draws are always the same. Resampling biases some statistics, such as a divergence, upwards: if `biased`, the interval is moved
+    back by the difference between the mean of the draws and the statistic itself.
     """
     random = np.random.default_rng(0)
     resampled = np.array([statistic(values[random.integers(0, len(values), len(values))]) for _ in range(draws)])
-    low, high = np.percentile(resampled, [2.5, 97.5], axis=0) + statistic(values) - np.mean(resampled, axis=0)
-    return low, high
+    low, high = np.percentile(resampled, [2.5, 97.5], axis=0)
+    back = statistic(values) - np.mean(resampled, axis=0) if biased else 0.0
+    return low + back, high + back
