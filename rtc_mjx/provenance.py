@@ -57,10 +57,12 @@ def of_recordings(lines: Sequence[str]) -> dict[str, Any]:
 
 
 def _commit() -> str | None:
+    """The commit, with "-dirty" where code, worlds or settings differ from it; results that are being written do not count."""
+    here = Path(__file__).parent
     try:
-        done = subprocess.run(
-            ["git", "describe", "--always", "--dirty"], cwd=Path(__file__).parent, capture_output=True, text=True, check=True
-        )
+        done = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=here, capture_output=True, text=True, check=True)
+        parts = [str(here), str(here.parent / "assets"), str(here.parent / "configs")]
+        changed = subprocess.run(["git", "status", "--porcelain", "--", *parts], cwd=here, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return None
-    return done.stdout.strip()
+    return done.stdout.strip() + ("-dirty" if changed.stdout.strip() else "")

@@ -78,7 +78,7 @@ def options(table: Mapping[str, Any]) -> list[str]:
     usual = settings.flat(settings.to_dict(settings.defaults(table["scene"]["name"], table["method"])))
     out: list[str] = []
     for name, value in held.items():
-        if value == usual.get(name) or name in ("seeds", "run", "resume"):
+        if value == usual.get(name) or name in {"seeds", "run", "resume", *settings.unread(table["method"])}:
             continue
         *parents, last = name.replace("_", "-").split(".")
         if isinstance(value, bool):
