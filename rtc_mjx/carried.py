@@ -37,7 +37,7 @@ def by_luck(scene: Scene, shuffled: evaluate.Features, expert: evaluate.Features
         By 'type yes, episode no' and so on: the number of `agents`, and a list over seeds of the scene's first main metric.
     """
     here = expert["decided"].astype(bool)
-    there = evaluate.elsewhere(here)
+    there = evaluate.elsewhere(scene, here)
     seeds = range(len(shuffled["decided"]))
     arrays = {name: x for name, x in shuffled.items() if name != evaluate.FINITE}
     metric, out = scene.main_metrics[0], {}
@@ -135,7 +135,7 @@ def reencoding(held: Trained, test: Demonstration) -> dict[str, list[float]]:
             out[name] = told(place, learner.play(agent, place.episode, g, scene.key_each(noise)), g)
         return out
 
-    other = evaluate.elsewhere(test)
+    other = evaluate.elsewhere(scene, test)
     keys = random.split(stream("type shift", 2), len(jax.tree.leaves(test)[0]))
 
     def of_seed(networks: Networks) -> dict[str, Array]:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import rich.progress
 from jax import random
-from jaxtyping import Array
+from jaxtyping import Array, Int
 from rich.console import Console
 from rich.table import Table
 
@@ -34,7 +34,7 @@ from rtc_mjx.provenance import made_by, of_recordings
 from rtc_mjx.pytree import in_parts
 from rtc_mjx.recorded_realism import challenge
 from rtc_mjx.runs import Run
-from rtc_mjx.scenes import Features, Recorded
+from rtc_mjx.scenes import Features, Recorded, Scene
 from rtc_mjx.sharding import ONE_DEVICE, Grid
 from rtc_mjx.trained import trained
 from rtc_mjx.trajectory import Demonstration, Trajectory
@@ -48,16 +48,25 @@ Watch = Callable[[Sequence[Any]], Iterable[Any]]
 RollTrained = Callable[[Demonstration, Donors, Array], dict[str, Features]]
 
 
-def donors(method: Method, test: Demonstration) -> Donors:
+def donors(scene: Scene, method: Method, test: Demonstration) -> Donors:
     """What types are read off: an episode's own demonstration, or that of another; nothing where no type is read off any."""
     if not method.reads:
         return {}
-    return {"paired": test.trajectory, "shuffled": elsewhere(test.trajectory)}
+    return {"paired": test.trajectory, "shuffled": elsewhere(scene, test.trajectory)}
 
 
-def elsewhere(held: Any) -> Any:
-    """Of each episode another one's: from half the set away, since neighbours may be of one recording."""
-    return jax.tree.map(lambda x: jnp.roll(x, len(x) // 2, axis=0), held)
+def elsewhere(scene: Scene, held: Any) -> Any:
+    """Of each test episode another one's (leading axis): of another recording, but where more than half of them are of one."""
+    other = another(scene.groups(len(jax.tree.leaves(held)[0])))
+    return jax.tree.map(lambda x: x[other], held)
+
+
+def another(groups: Int[np.ndarray, "count"]) -> Int[np.ndarray, "count"]:
+    """A permutation that puts one of another group in each place, as far as that can be: half the way round, group by group."""
+    order = np.argsort(groups, kind="stable")
+    out = np.empty(len(order), int)
+    out[order] = np.roll(order, len(order) // 2)
+    return out
 
 
 def roller(learner: Learner, samples: int, watch: Watch = iter, grid: Grid = ONE_DEVICE) -> Roll:
@@ -134,7 +143,7 @@ def evaluate(run: Run, episodes: int, watch: Watch = iter) -> dict[str, Any]:
     config, learner, networks = held.config, held.learner, held.networks
     test = dataset.demonstrations(config.scene, episodes, dataset.TEST)
     roll, shown = roller(learner, config.scene.samples, watch), dataset.without_truth(test)
-    given = donors(learner.method, shown)
+    given = donors(learner.scene, learner.method, shown)
     features = roll(networks, shown, given, stream("evaluation", 0))
     expert, second = (made(config.scene, episodes) for made in (reference.experts, reference.more_experts))
     table = score(config, features, expert)
@@ -188,8 +197,8 @@ def reactions(
     again = dataset.without_truth(dataset.redriven(scene, count, dataset.TEST, scene.flipped))
     first = jax.tree.map(lambda x: x[:count], shown)
     theirs, before = (reference.expert_features(scene, held)["decided"] for held in (again, first))
-    turned = Demonstration(again.episode, first.trajectory, ())
-    flipped = roll(turned, donors(learner.method, turned), key)
+    given = jax.tree.map(lambda x: x[:count], donors(scene, learner.method, shown))
+    flipped = roll(Demonstration(again.episode, first.trajectory, ()), given, key)
 
     def told(before: np.ndarray, after: np.ndarray) -> dict[str, list[float]]:
         shares = {"as_it_was": before, "flipped": after, "like_expert": after == theirs}
@@ -200,15 +209,15 @@ def reactions(
 
 
 def _summaries(config: Config, features: Features, expert: Features, values: dict[str, list[float]]) -> dict[str, dict[str, Any]]:
-    """Of each metric: per seed, mean, standard deviation, and a bootstrap interval of the mean over test episodes."""
-    ranges = config.scene.ranges(expert)
+    """Of each metric: per seed, mean, standard deviation, and a bootstrap interval of the mean over groups of test episodes."""
+    ranges, groups = config.scene.ranges(expert), config.scene.groups(next(iter(expert.values())).shape[1])
 
     def means_over_seeds(rows: np.ndarray) -> np.ndarray:
         theirs = {k: v[:, rows] for k, v in expert.items()}
         drawn = [{k: v[i][:, rows] for k, v in features.items()} for i in range(config.seeds)]
         return np.mean([list(config.scene.metrics(d, theirs, ranges).values()) for d in drawn], axis=0)
 
-    low, high = metrics.bootstrap(np.arange(next(iter(expert.values())).shape[1]), means_over_seeds, draws=200, biased=True)
+    low, high = metrics.bootstrap(np.arange(len(groups)), means_over_seeds, draws=200, biased=True, groups=groups)
     out = {}
     for (name, per_seed), *interval in zip(values.items(), low, high, strict=True):
         spread = float(np.std(per_seed, ddof=1)) if len(per_seed) > 1 else 0.0

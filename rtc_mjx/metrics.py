@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 
 def jsd(samples: np.ndarray, reference: np.ndarray, *, bins: int, limits: tuple[float, float]) -> float:
@@ -30,15 +30,33 @@ def _relative_entropy(p: np.ndarray, q: np.ndarray) -> float:
 
 
 def bootstrap(
-    values: np.ndarray, statistic: Callable[[np.ndarray], Any] = np.mean, *, draws: int = 1000, biased: bool = False
+    values: np.ndarray,
+    statistic: Callable[[np.ndarray], Any] = np.mean,
+    *,
+    draws: int = 1000,
+    biased: bool = False,
+    groups: Int[np.ndarray, "rows"] | None = None,
 ) -> tuple[Any, Any]:
     """The 95 % percentile interval of a statistic (a number, or an array of them) over resampled rows of `values`.
 
-    The draws are always the same. Resampling biases some statistics, such as a divergence, upwards: if `biased`, the interval is moved
-    back by the difference between the mean of the draws and the statistic itself.
+    The draws are always the same.
+
+    Args:
+        values: a row a sample.
+        statistic: of any rows.
+        draws: how often rows are drawn.
+        biased: resampling biases some statistics, such as a divergence, upwards; the interval is then moved back by the difference
+            between the mean of the draws and the statistic itself.
+        groups: of each row the group that it belongs to; whole groups are drawn. Each row is one of its own unless given.
     """
     random = np.random.default_rng(0)
-    resampled = np.array([statistic(values[random.integers(0, len(values), len(values))]) for _ in range(draws)])
+    own = np.arange(len(values)) if groups is None else groups
+    members = [np.flatnonzero(own == group) for group in np.unique(own)]
+
+    def drawn() -> np.ndarray:
+        return values[np.concatenate([members[i] for i in random.integers(0, len(members), len(members))])]
+
+    resampled = np.array([statistic(drawn()) for _ in range(draws)])
     low, high = np.percentile(resampled, [2.5, 97.5], axis=0)
     back = statistic(values) - np.mean(resampled, axis=0) if biased else 0.0
     return low + back, high + back

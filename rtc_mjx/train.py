@@ -162,7 +162,7 @@ class Tests:
         demonstrations = dataset.demonstrations(config.scene, config.experts.test, dataset.TEST)
         self.expert = reference.experts(config.scene, config.experts.test)
         self.episodes = dataset.without_truth(demonstrations)
-        self.donors = evaluate.donors(learner.method, self.episodes)
+        self.donors = evaluate.donors(config.scene, learner.method, self.episodes)
 
     def __call__(self, state: TrainState) -> dict[str, list[float]]:
         """Metrics by name; those under other types than the prior's are prefixed."""

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from rtc_mjx import cache, cli, dataset, evaluate, reference, shift_report
 from rtc_mjx.carried import LEAST_EPISODES, by_luck, reencoding, told_by_types
@@ -82,7 +83,7 @@ def analyse(run: Run, episodes: int, experts: int, probed: int, progress: Progre
 def of_types(held: Trained, test: Demonstration, watch: evaluate.Watch) -> dict[str, Any]:
     """Rollouts per source of types, 'prior', 'paired', 'same_xi' and 'shuffled', and what they are made to tell."""
     scene, learner, key = held.config.scene, held.learner, stream("type shift", 0)
-    given, roll = evaluate.donors(learner.method, test), evaluate.roller(learner, scene.samples, watch)
+    given, roll = evaluate.donors(scene, learner.method, test), evaluate.roller(learner, scene.samples, watch)
     if scene.redrivable:
         others = dataset.by_others(scene, len(jax.tree.leaves(test)[0]), dataset.TEST, 1)
         given["same_xi"] = jax.tree.map(lambda x: x[:, 0], others.trajectory)
@@ -104,6 +105,8 @@ def _probed(held: Trained, count: int, left_out: dict[str, str]) -> dict[str, An
     if there < LEAST_EPISODES:
         left_out["information"] = f"a probe needs {LEAST_EPISODES} demonstrations; the scene has {there} that it did not learn from"
         return {"information": {}}
+    by_group = np.argsort(held.config.scene.groups(there), kind="stable")  # a recording is in one part of the probe, or at an edge in two
+    fresh = jax.tree.map(lambda x: x[by_group], fresh)
     return told_by_types(held, dataset.without_truth(fresh), fresh.truth, PROBE)
 
 

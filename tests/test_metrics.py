@@ -41,6 +41,17 @@ def test_bootstrap_interval_covers_the_mean_and_shrinks_with_size():
     assert widths[0] == pytest.approx(2 * 1.96 / 10, rel=0.2) and widths[1] == pytest.approx(widths[0] / 10, rel=0.2)
 
 
+def test_bootstrap_draws_whole_groups():
+    """Copies of a sample tell nothing new of its mean: what they are called is enough to know that."""
+    sample = np.random.default_rng(4).normal(size=40)
+    for copies in (2, 5):
+        many, of = np.repeat(sample, copies), np.repeat(np.arange(40), copies)
+        shuffled = np.random.default_rng(5).permutation(len(many))
+        assert metrics.bootstrap(many[shuffled], groups=of[shuffled]) == pytest.approx(metrics.bootstrap(sample), abs=1e-12)
+        low, high = metrics.bootstrap(many)
+        assert high - low < 0.8 * np.subtract(*metrics.bootstrap(sample)[::-1])
+
+
 def test_bootstrap_interval_of_a_biased_statistic_is_around_its_value():
     """Resampled divergences are all greater than the divergence itself."""
     random = np.random.default_rng(2)

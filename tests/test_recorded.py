@@ -249,6 +249,21 @@ def test_no_more_scenes_are_held_than_asked_for_and_a_hash_chooses_them(mixed):
         assert log[0, 30, 0] == pytest.approx(30.0 if name.endswith("/11") else 27.0, abs=0.02)
 
 
+def test_types_of_another_episode_are_of_another_recording(mixed):
+    scene = Recorded(data=str(mixed))
+    recordings = np.array([name.rsplit("/", 1)[0] for name in scene.pool("test").names])
+    assert 1 < len(set(recordings)) < len(recordings)
+    assert np.all(evaluate.elsewhere(scene, np.unique(recordings, return_inverse=True)[1]) != scene.groups(len(recordings)))
+
+
+@pytest.mark.parametrize("sizes", [(1,) * 7, (3, 2, 1), (4, 4), (5, 1, 1), (2, 3, 3, 1)])
+def test_another_is_a_permutation_into_other_groups_as_far_as_there_are_any(sizes):
+    groups = np.random.default_rng(0).permutation(np.repeat(np.arange(len(sizes)), sizes))
+    other, most = evaluate.another(groups), max(sizes)
+    assert sorted(other) == list(range(len(groups)))
+    assert np.sum(groups[other] == groups) == max(0, 2 * most - len(groups))
+
+
 def test_what_conversion_dropped_is_among_the_notes(mixed):
     told = Recorded(data=str(mixed)).converted()
     assert told["bike lanes, not for driving (in converting 9 recordings to 18 scenes)"] == 9

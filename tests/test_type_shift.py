@@ -303,4 +303,4 @@ def test_shuffled_types_are_told_apart_in_the_figure_only_where_luck_tells_them_
 def test_types_are_read_off_trajectories_by_whatever_a_method_has():
     test = jax.tree.map(jnp.asarray, dataset.without_truth(dataset.demonstrations(SCENE, 4, dataset.TEST)))
     for method, there in {"rtc_c": True, "info_mgail_d": True, "symphony": True, "mgail": False}.items():
-        assert bool(evaluate.donors(METHODS[method], test)) is there
+        assert bool(evaluate.donors(SCENE, METHODS[method], test)) is there

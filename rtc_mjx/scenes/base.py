@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from rtc_mjx.physics import PhysicsState, World
 from rtc_mjx.pytree import pytree
@@ -191,6 +191,10 @@ class Scene(abc.ABC):
     def recorded(self, part: Literal["train", "test"], count: int) -> Episode | None:
         """So many of the recorded episodes of a part (all, if there are fewer), with a leading axis; None where episodes are drawn."""
         return None
+
+    def groups(self, count: int) -> Int[np.ndarray, "count"]:
+        """Of each of so many test episodes the group that it belongs to: episodes of one recording are not independent of each other."""
+        return np.arange(count)
 
     def ready(self) -> None:
         """Gets what a training needs from outside, so that what is wrong with it is said before anything is written."""

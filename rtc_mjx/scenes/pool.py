@@ -29,6 +29,11 @@ PARTS: dict[Part, str] = {"train": "learn from", "test": "test on"}
 FOLLOWED, HEADED = 0.5, 0.25  # m and rad, mean errors of position and heading up to which a car follows its log
 
 
+def scenario_of(name: str) -> str:
+    """The recording, by name, that a scene of this name is of."""
+    return name.rsplit("/", 1)[0]
+
+
 @dataclass(frozen=True)
 class Place:
     """A scene that could be had.
@@ -51,7 +56,7 @@ class Place:
     @property
     def scenario(self) -> str:
         """Of which recording it is, by name."""
-        return self.name.rsplit("/", 1)[0]
+        return scenario_of(self.name)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from rtc_mjx import inverse_dynamics
 from rtc_mjx.errors import UsageError
@@ -29,7 +29,7 @@ from rtc_mjx.logs.store import Listed, listed, none_of
 from rtc_mjx.pytree import in_parts, pytree
 from rtc_mjx.scenes.base import Actor, Features, Ranges
 from rtc_mjx.scenes.driving import CONTROL_EVERY, Driving, Road
-from rtc_mjx.scenes.pool import PARTS, Part, Place, Pool, chosen, driven, gathered, of_part
+from rtc_mjx.scenes.pool import PARTS, Part, Place, Pool, chosen, driven, gathered, of_part, scenario_of
 from rtc_mjx.scenes.routes import RouteOptions
 from rtc_mjx.trajectory import Demonstration, Episode, Trajectory
 
@@ -167,6 +167,10 @@ class Recorded(Driving):
         """So many of the recorded episodes of a part, the first of its pool (all, if there are fewer), with a leading axis."""
         run, held = jax.jit(jax.vmap(self.replayed)), self.pool(part)
         return in_parts(lambda rows: run(*rows), jax.tree.map(lambda x: x[:count], (held.logs, held.actions, held.connected)), AT_ONCE)
+
+    def groups(self, count: int) -> Int[np.ndarray, "count"]:
+        """Of each of the first test episodes the recording that it is of, by number."""
+        return np.unique([scenario_of(name) for name in self.pool("test").names[:count]], return_inverse=True)[1]
 
     def log(self, key: jax.Array) -> LoggedScene:
         """One of the scenes to learn from."""
