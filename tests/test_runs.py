@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from learning import ON_SCENE, SCENE, settings
 
-from rtc_mjx import config, evaluate, render, report, train
+from rtc_mjx import config, evaluate, populations, render, report, train
 from rtc_mjx.config import Config
 from rtc_mjx.errors import RunError, UsageError
 from rtc_mjx.runs import Run
@@ -265,6 +265,27 @@ def test_render_writes_a_video_in_which_things_move(whole, tmp_path, camera):
     assert np.abs(frames[0] - frames[-1]).max() > 40 and frames[0].std() > 5
 
 
+def test_populations_are_drawn_beside_experts_in_the_same_part_of_the_world(whole, tmp_path):
+    populations.main([str(whole.folder), "--out", str(tmp_path / "who.png"), "--agents", "3"])
+    assert (tmp_path / "who.png").read_bytes().startswith(b"\x89PNG")
+    scene, shown, held = populations.of_runs([whole], 2, 3)
+    assert list(held) == ["expert", "rtc_c"]
+    assert {np.asarray(track.states.qpos).shape for track in held.values()} == {(2, 3, SCENE.steps + 1, 2)}
+    left, right, *_ = populations.draw(scene, shown, held).axes
+    assert left.get_xlim() == right.get_xlim() and left.get_ylim() == right.get_ylim()
+
+
+@pytest.mark.parametrize("name", ["double_goal", "intersection"])
+def test_ways_are_coloured_by_where_they_lead_from_where_they_headed(name):
+    scene, heading = SCENES[name](), 2.0 if name == "intersection" else 0.0
+    turned = [(1.0, 0.5), (1.0, -0.1), (0.8, -2.5), (0.05, 1.5)]  # how far, and by which angle
+    ways = np.zeros((4, 2, scene.world.mj.nq))
+    ways[:, 1, :2] = [(far * np.cos(heading + angle), far * np.sin(heading + angle)) for far, angle in turned]
+    if name == "intersection":
+        ways[:, :, 2] = heading
+    assert populations.directions(scene, ways) == [populations.LEFT, populations.STRAIGHT, populations.RIGHT, populations.STRAIGHT]
+
+
 def test_the_ray_caster_sees_what_is_there():
     """A red sphere before the camera is a red disc in the middle, sky around it."""
     import mujoco
@@ -419,6 +440,10 @@ def test_incomplete_and_damaged_runs_are_refused(whole, tmp_path):
         (render.main, ["--run", "RUN", "--seed", "2"], "seed 2.*0 to 1"),
         (render.main, ["--run", "RUN", "--size", "33x5"], "33x5"),
         (render.main, ["--run", "RUN", "--types", "0"], "types 0"),
+        (populations.main, ["RUN", "--out", "picture.jpg"], r"picture\.jpg.*\.png"),
+        (populations.main, ["RUN", "--out", "picture.png", "--seed", "2"], "seed 2.*0 to 1"),
+        (populations.main, ["RUN", "RUN", "--out", "picture.png"], "one run a method"),
+        (populations.main, ["RUN", "--out", "picture.png", "--agents", "0"], "agents 0"),
         (report.main, ["/nowhere", "--out", "x"], "nowhere is not a run"),
     ],
 )
