@@ -30,10 +30,10 @@ from rich.table import Table
 
 from rtc_mjx import cache, cli, config, dataset, pile_up, scaling
 from rtc_mjx.errors import UsageError
-from rtc_mjx.learner import compiled_chunk, start_all
 from rtc_mjx.physics import OneStep, PhysicsState, Surroundings, World, load, rest_state, rest_surroundings, simulate, specialised_step
 from rtc_mjx.physics.car import WHEELBASE
 from rtc_mjx.provenance import made_by
+from rtc_mjx.updates import compiled_chunk, start_all
 
 WORLDS: dict[str, Callable[[], World]] = {
     "point_mass": lambda: load("double_goal"),

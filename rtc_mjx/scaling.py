@@ -24,9 +24,10 @@ from rich.table import Table
 
 from rtc_mjx import config, dataset, sharding
 from rtc_mjx.errors import RunError
-from rtc_mjx.learner import Learner, compiled_chunk, start_all
+from rtc_mjx.learner import Learner
 from rtc_mjx.scenes import Scene
 from rtc_mjx.sharding import BATCH, SEED, Grid
+from rtc_mjx.updates import compiled_chunk, start_all
 
 METHOD = "rtc_c"
 UPDATES = 4  # of a timed sample

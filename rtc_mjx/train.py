@@ -25,12 +25,13 @@ from rtc_mjx.cluster import joined
 from rtc_mjx.config import Config
 from rtc_mjx.errors import DivergedError, UsageError
 from rtc_mjx.keys import stream
-from rtc_mjx.learner import Learner, TrainState, compiled_chunk, start_all, start_shapes
+from rtc_mjx.learner import Learner
 from rtc_mjx.methods import METHODS
 from rtc_mjx.progress import Reporter
 from rtc_mjx.runs import Follower, Run
 from rtc_mjx.sharding import Grid
 from rtc_mjx.team import ALONE, Team
+from rtc_mjx.updates import TrainState, compiled_chunk, start_all, start_shapes
 
 
 def train(config: Config, team: Team = ALONE) -> Run:

@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 from rtc_mjx import dataset
 from rtc_mjx.config import Config
-from rtc_mjx.learner import Learner, start_shapes
+from rtc_mjx.learner import Learner
 from rtc_mjx.models import Networks
 from rtc_mjx.runs import Run
+from rtc_mjx.updates import start_shapes
 
 
 @dataclass(frozen=True)

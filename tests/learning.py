@@ -8,11 +8,12 @@ import jax.numpy as jnp
 
 from rtc_mjx import dataset
 from rtc_mjx.config import Config, Experts, Intervals
-from rtc_mjx.learner import Learner, OptimiserOptions, start
+from rtc_mjx.learner import Learner, OptimiserOptions
 from rtc_mjx.losses import LossWeights
 from rtc_mjx.methods import METHODS
 from rtc_mjx.models import ModelOptions
 from rtc_mjx.scenes import DoubleGoal
+from rtc_mjx.updates import start
 
 SCENE = DoubleGoal(steps=16)
 MODEL = ModelOptions(width=16, type_size=3, type_count=4, prior_components=3)

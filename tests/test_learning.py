@@ -11,15 +11,16 @@ from flax import nnx
 from jax import random
 from learning import CLOSED_LOOP, ON_SCENE, SCENE, SCORED, begin, experts, learner
 
-from rtc_mjx import learner as learning
+from rtc_mjx import gradients as learning
 from rtc_mjx.agent_types import SOURCES
-from rtc_mjx.learner import Played, gradients, train_step
+from rtc_mjx.gradients import Played, gradients
 from rtc_mjx.losses import LOSSES, Case, LossWeights
 from rtc_mjx.methods import METHODS
 from rtc_mjx.models import Networks
 from rtc_mjx.networks import Encoder, Layout, Reader, Scores
 from rtc_mjx.rollout import rollout
 from rtc_mjx.scenes import ItemSet
+from rtc_mjx.updates import train_step
 
 NOTHING = LossWeights(**{f.name: 0.0 for f in dataclasses.fields(LossWeights) if isinstance(f.default, float)}, adversarial_ramp=0)
 ENCODING = tuple(name for name in ON_SCENE if METHODS[name].encodes)

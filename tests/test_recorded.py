@@ -16,7 +16,6 @@ from rtc_mjx import config, data, dataset, evaluate, inverse_dynamics, reference
 from rtc_mjx.config import Config
 from rtc_mjx.errors import UsageError
 from rtc_mjx.inverse_dynamics import Fit, FitOptions, fit, start_of
-from rtc_mjx.learner import compiled_chunk, start_all
 from rtc_mjx.logs import store
 from rtc_mjx.logs.convert import Options
 from rtc_mjx.logs.store import scenes
@@ -30,6 +29,7 @@ from rtc_mjx.scenes.pool import FOLLOWED, HEADED, fitted, part_of
 from rtc_mjx.scenes.pool import driven as logged
 from rtc_mjx.scenes.recorded import Recorded
 from rtc_mjx.team import ALONE, Team
+from rtc_mjx.updates import compiled_chunk, start_all
 
 STEP, SUBSTEPS = 0.3, 6
 KINDS = ("womd_scenario", "womd_tf_example", "gpudrive_json", "scenarionet_waymo", "scenarionet_nuscenes")

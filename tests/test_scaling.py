@@ -24,10 +24,10 @@ from learning import begin, experts, learner, settings
 from rtc_mjx import cluster, config, train
 from rtc_mjx.cluster import Hardware
 from rtc_mjx.errors import RunError, UsageError
-from rtc_mjx.learner import train_step
 from rtc_mjx.runs import Run
 from rtc_mjx.sharding import ALL_ROWS, BATCH, Rows, grid
 from rtc_mjx.team import HELLO_S, Place, Team, meet
+from rtc_mjx.updates import train_step
 
 ROOT = Path(__file__).resolve().parents[1]
 LIMIT_S = 240  # of a subprocess: it must end by itself long before

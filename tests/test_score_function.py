@@ -14,7 +14,7 @@ from learning import ON_SCENE, SCENE, SCORED, begin, learner
 from test_learning import plain_rollouts, size
 
 from rtc_mjx import credit
-from rtc_mjx import learner as learning
+from rtc_mjx import gradients as learning
 from rtc_mjx.agent_types import Typed
 from rtc_mjx.credit import Credit
 from rtc_mjx.losses import LOSSES, Case

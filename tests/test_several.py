@@ -14,7 +14,8 @@ from rtc_mjx.config import Config, Experts, Intervals
 from rtc_mjx.environment import Environment
 from rtc_mjx.errors import UsageError
 from rtc_mjx.geometry import capsule_gap
-from rtc_mjx.learner import OptimiserOptions, compiled_chunk, gradients, start, start_all, start_shapes
+from rtc_mjx.gradients import gradients
+from rtc_mjx.learner import OptimiserOptions
 from rtc_mjx.logs import VEHICLE
 from rtc_mjx.methods import METHODS
 from rtc_mjx.models import ModelOptions
@@ -26,6 +27,7 @@ from rtc_mjx.scenes.driver import expert_driver
 from rtc_mjx.scenes.routes import nearest_lane
 from rtc_mjx.scenes.several import cars_apart, cars_together
 from rtc_mjx.trajectory import Demonstration
+from rtc_mjx.updates import compiled_chunk, start, start_all, start_shapes
 
 SMALL = ModelOptions(width=8, discriminator_width=8, mixture=1, type_size=2, prior_components=2)
 

@@ -17,13 +17,14 @@ from rtc_mjx import carried, config, dataset, evaluate, probe, shift_report, typ
 from rtc_mjx.agent_types import Continuous
 from rtc_mjx.distributions import Gaussian
 from rtc_mjx.errors import UsageError
-from rtc_mjx.learner import Learner, start_all
+from rtc_mjx.learner import Learner
 from rtc_mjx.methods import METHODS
 from rtc_mjx.probe import ProbeOptions, information, noisy_copy
 from rtc_mjx.realism import BINS, Bins, compared
 from rtc_mjx.runs import Run
 from rtc_mjx.scenes import Actor, DoubleGoal
 from rtc_mjx.trained import Trained
+from rtc_mjx.updates import start_all
 
 QUICK = ProbeOptions(updates=150, learning_rate=3e-3, null=3)
 
