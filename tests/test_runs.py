@@ -365,14 +365,14 @@ def test_wrong_options_are_refused_in_one_line(argv, named):
 )
 def test_wrong_settings_files_are_refused_in_one_line(text, named, tmp_path, monkeypatch):
     (tmp_path / "double_goal.toml").write_text(text)
-    monkeypatch.setattr(config, "configs", lambda: tmp_path)
+    monkeypatch.setattr(config.files, "configs", lambda: tmp_path)
     refused(["--scene", "double_goal"], named)
 
 
 def test_settings_come_from_defaults_then_file_then_method_then_command_line(tmp_path, monkeypatch):
     text = "updates = 100\nbatch = 8\nseeds = 3\n[losses]\nadversarial = 0.5\n[methods.bc]\nbatch = 12\nseeds = 5\n"
     (tmp_path / "double_goal.toml").write_text(text)
-    monkeypatch.setattr(config, "configs", lambda: tmp_path)
+    monkeypatch.setattr(config.files, "configs", lambda: tmp_path)
     held = config.from_command_line(["--method", "bc", "--seeds", "7"], "train")
     assert (held.updates, held.batch, held.seeds, held.losses.adversarial) == (100, 12, 7, 0.5)
     assert held.losses.reconstruction == Config().losses.reconstruction

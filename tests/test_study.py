@@ -357,7 +357,7 @@ def test_committed_settings_that_changed_are_seen_too(again, monkeypatch):
     """Going on with a run takes its own settings; the study asks for those of today."""
     (again / "configs").mkdir()
     (again / "configs" / "double_goal.toml").write_text("[losses]\ncloning = 0.5\n")
-    monkeypatch.setattr(config, "configs", lambda: again / "configs")
+    monkeypatch.setattr(config.files, "configs", lambda: again / "configs")
     with pytest.raises(UsageError, match=r"(wanted|is wanted).*has"):
         study.main(command(again, "bc"))
 
