@@ -59,7 +59,7 @@ def read(held: Trained, demonstrations: Demonstration) -> np.ndarray:
     keys = random.split(stream("type shift", 1), len(jax.tree.leaves(rows)[0]))
 
     def of_seed(networks: Networks) -> Array:
-        at_once = min(len(keys), evaluate.AT_ONCE)
+        at_once = min(len(keys), evaluate.at_once())
         return lax.map(lambda row: one(networks, *row), (rows, keys), batch_size=at_once)
 
     return np.asarray(jax.jit(lambda networks: lax.map(of_seed, networks))(held.networks))
@@ -139,7 +139,7 @@ def reencoding(held: Trained, test: Demonstration) -> dict[str, list[float]]:
     keys = random.split(stream("type shift", 2), len(jax.tree.leaves(test)[0]))
 
     def of_seed(networks: Networks) -> dict[str, Array]:
-        return lax.map(lambda rows: one(networks, *rows), (test, other, keys), batch_size=min(len(keys), evaluate.AT_ONCE))
+        return lax.map(lambda rows: one(networks, *rows), (test, other, keys), batch_size=min(len(keys), evaluate.at_once()))
 
     run = jax.jit(lambda networks: lax.map(of_seed, networks))
     # a rollout that leaves what the encoder knows may be told from its type by thousands of bits: the median is not moved by it

@@ -39,7 +39,9 @@ from rtc_mjx.sharding import ONE_DEVICE, Grid
 from rtc_mjx.trained import trained
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
-AT_ONCE = 2048  # rollouts simulated at once
+AT_ONCE = {"cpu": 128}  # rollouts simulated at once, by backend: in a CPU's caches (2,048 of driving cost three times as much there)
+MANY = 2048  # on others
+REACTIONS = 2048  # rollouts that say how agents react to luck turned round
 FINITE = "finite"  # the feature that says whether a rollout is
 
 Donors = dict[str, Trajectory]  # the trajectory that each episode's type is inferred from, by source of types
@@ -110,7 +112,12 @@ def roller(learner: Learner, samples: int, watch: Watch = iter, grid: Grid = ONE
 
 def part_size(count: int, samples: int) -> int:
     """How many of so many episodes are simulated at once."""
-    return min(count, max(1, AT_ONCE // samples))
+    return min(count, max(1, at_once() // samples))
+
+
+def at_once() -> int:
+    """How many rollouts are simulated at once."""
+    return AT_ONCE.get(jax.default_backend(), MANY)
 
 
 def _finite(track: Trajectory) -> Array:
@@ -183,7 +190,7 @@ def reactions(
 ) -> dict[str, dict[str, list[float]]]:
     """What agents do when luck is turned round at the same type (method notes, section 7), beside the experts with the same minds.
 
-    On as many of the episodes as are simulated at once; `key` is that of the rollouts that `features` are of.
+    On the first episodes, as many as `REACTIONS` are rollouts of; `key` is that of the rollouts that `features` are of.
 
     Returns:
         By who acts: `as_it_was` and `flipped`, the share that did what luck bears on, and `like_expert`, the share whose decision
@@ -193,7 +200,7 @@ def reactions(
     scene = learner.scene
     if scene.flipped(shown.episode) is None:
         return {}
-    count = part_size(len(jax.tree.leaves(shown)[0]), scene.samples)
+    count = min(len(jax.tree.leaves(shown)[0]), max(1, REACTIONS // scene.samples))
     again = dataset.without_truth(dataset.redriven(scene, count, dataset.TEST, scene.flipped))
     first = jax.tree.map(lambda x: x[:count], shown)
     theirs, before = (reference.expert_features(scene, held)["decided"] for held in (again, first))
