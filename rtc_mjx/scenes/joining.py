@@ -146,7 +146,7 @@ def choose(me: Approach, others: Stream) -> tuple[Float[Array, ""], Float[Array,
     rank = jnp.where(spare > 0, ahead[:, None] - 0.01 * jnp.arange(len(POWER)), -2 * NOBODY)
     safe = jnp.any(spare > 0)
     choice = jnp.where(safe, jnp.argmax(rank), jnp.argmax(spare))
-    waits = jnp.maximum(arrive(me.line - SHORT, me.speed, jnp.array(NOBODY)), -GIVES_UP)
+    waits = jnp.maximum(arrive(me.line, me.speed, jnp.array(NOBODY)), -GIVES_UP)
     waits = jnp.minimum(free_road(me, me.speed, jnp.array(0.0), power[0]), waits)
     stops = me.line > me.speed**2 / (2 * GIVES_UP)
     return jnp.where(stops & ~safe, waits, pull.reshape(-1)[choice]), power[choice % len(POWER)]
@@ -163,7 +163,7 @@ def in_mind(me: Approach, others: Stream, ahead: Array, power: Array) -> tuple[F
         clear = (room + front + others.apart - place) / jnp.maximum(others.pace, 0.5)  # s until they leave me room
         wanted, gap = allowed(me, gone), jnp.maximum(place - others.apart, 0.3)
         follows = follow_calmly(speed, wanted, gap, speed - others.pace, me.headway, power)
-        pull = jnp.where(leads, jnp.where(room > 0, arrive(room - SHORT, speed, clear), follows), NOBODY)
+        pull = jnp.where(leads, jnp.where(room > 0, arrive(room, speed, clear), follows), NOBODY)
         pull = jnp.clip(jnp.minimum(free_road(me, speed, gone, power), jnp.min(pull, initial=NOBODY)), -GIVES_UP, 2.5)
         spare = jnp.where(leads, place - others.apart - front, -place - others.apart - behind)
         spare = jnp.min(jnp.where(others.there & (room < 0), spare, NOBODY), initial=NOBODY)
@@ -175,9 +175,10 @@ def in_mind(me: Approach, others: Stream, ahead: Array, power: Array) -> tuple[F
 
 
 def arrive(room: Array, speed: Array, when: Array) -> Float[Array, "*users"]:
-    """Constant acceleration in m/s^2 by which `room` m are not gone before `when` s from now; who had to stop for it brakes evenly."""
-    room, when = jnp.maximum(room, 0.1), jnp.maximum(when, 0.1)
-    return jnp.where(2 * room > speed * when, 2 * (room - speed * when) / when**2, -(speed**2) / (2 * room))
+    """Constant acceleration in m/s^2 by which `room` m are not gone before `when` s from now; who had to stop for it stops SHORT."""
+    in_time = 2 * (room - speed * when) / jnp.maximum(when, 0.1) ** 2
+    stop = -(speed**2) / (2 * jnp.maximum(room - SHORT, 0.1))
+    return jnp.where(when > 0, jnp.where(2 * room > speed * when, in_time, stop), NOBODY)
 
 
 def follow_calmly(speed: Array, wanted: Array, gap: Array, closing: Array, headway: Array, most: Array) -> Float[Array, "*users"]:
