@@ -37,6 +37,7 @@ JOINED = 14.0  # m past a give-way line, where the way onto the ring has become 
 HASTE = 8.0  # m/s, than which nobody who is driven is faster here
 SLOWLY = 4.2  # m/s, how fast the others take the bend onto the ring at least
 BEFORE = 1.5  # s by which they join before somebody who is driven could be there
+LATE = 3.0  # m from nose to give-way line, from where nobody stops before it
 PRESENT = (0.75, 0.65, 0.5, 0.6, 0.6)
 LAST = (3, 4, 2)  # in the traffic: the last that comes from the east, the north, the west
 
@@ -162,7 +163,8 @@ def traffic(key: jax.Array, road: RoadGraph, radius: Array, back: Array, taken: 
         headway=random.uniform(next(keys), (count,), minval=1.0, maxval=1.8), length=length, leader=jnp.array([-1, 0, 1, -1, -1]),
         until=jnp.full(count, 1e3), **{**free, "stop": jnp.full(count, ARM), "signals": signals},
     )  # fmt: skip
-    present = random.bernoulli(next(keys), jnp.array(PRESENT))
+    late = waits & (ARM - station < length / 2 + LATE)
+    present = random.bernoulli(next(keys), jnp.array(PRESENT)) & ~late  # nobody is where it can neither wait nor go
     poses, speeds = drive(drivers, 2.0, times)
     sizes = jnp.stack([length, jnp.full(count, 1.9)], axis=1)
     return moving(poses, speeds, sizes, jnp.where(present, VEHICLE, 0))
