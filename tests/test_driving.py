@@ -110,10 +110,10 @@ def test_the_world_has_its_named_parts_and_two_cameras(scene):
 
 
 def test_experts_arrive_without_accident(scene):
-    """At the intersection rates like those of the paper's data: collisions below 1.5 %, off the road below 1 % of the time."""
+    """Rates like those of the paper's data: collisions below 1.5 %, off the road below 1 % of the time."""
     held, features = demonstrated(scene.name)
-    assert np.mean(features["collision"]) <= {"intersection": 0.015, "roundabout": 0.025, "merge": 0.06}[scene.name]
-    assert np.mean(features["offroad"]) < (0.02 if scene.name == "merge" else 0.01)
+    assert np.mean(features["collision"]) < 0.015
+    assert np.mean(features["offroad"]) < 0.01
     assert np.mean(features["ran_red"]) < 0.02
     assert np.mean(features["progress"]) > 15 and np.max(features["progress"]) > 50
 

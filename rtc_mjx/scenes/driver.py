@@ -4,9 +4,10 @@
                 -> obstacles: bends, who is ahead, the stop line, who goes first -> the hardest braking that any of them asks for
 
 Internal to the driver, and drawn anew for each episode: route, speed, headway, the gap it takes, how late it sees a signal change,
-whether it still goes at amber, where in the lane it keeps.
+whether it still goes at amber, where in the lane it keeps. Where ways join, `rtc_mjx.scenes.joining` has the pedals.
 """
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -31,14 +32,17 @@ AFTER = tuple(0.4 * i for i in range(13))  # s ahead, to which others are expect
 WITHIN = {"vehicle": 2.1, "walker": 1.9}  # m from the middle of the way: ahead of me
 CROSSES = {"vehicle": 3.0, "walker": 2.4}  # m from the middle of the way: will be in it
 CANNOT_STOP = 7.5  # m/s^2: a line that takes harder braking is passed
-ENTERED = 7.0  # m past a give-way line, where one is in everybody's way
-PASSED = -11.0  # m, behind a give-way line one no longer gives way
 LATEST = 4  # control steps by which a driver may see a signal change late
 ROUTES = (0.9, 1.1, 0.9)  # how often each is taken, where there are three
 
+Pedals = Callable[[Array, Array, Array, Array, dict[str, Array]], Array]  # own, route, signal, users, truth -> m/s^2
 
-def expert_driver(key: jax.Array, scene: "Driving", routes: Routes, speeds: tuple[float, float]) -> tuple[Actor, Any]:
-    """A driver who has these routes to choose from, and its internal truth."""
+
+def expert_driver(
+    key: jax.Array, scene: "Driving", routes: Routes, speeds: tuple[float, float], pedals: Pedals | None = None
+) -> tuple[Actor, Any]:
+    """A driver who has these routes to choose from, and its internal truth; by default it minds signals and crossings."""
+    pedals = pedals or mind_signals_and_crossings
     keys = iter(random.split(key, 10))
     valid = routes.valid
     weight = jnp.where(valid, jnp.resize(jnp.array(ROUTES), valid.shape), 0.0)
@@ -86,7 +90,7 @@ def steering(own: Array, route: Array, aside: Array) -> Float[Array, ""]:
     return jnp.clip(jnp.arctan(2 * WHEELBASE * target[1] / far**2), -0.6, 0.6)
 
 
-def pedals(
+def mind_signals_and_crossings(
     own: Array, route: Array, signal: Float[Array, "3"], users: Float[Array, "users 14"], truth: dict[str, Array]
 ) -> Float[Array, ""]:
     """Acceleration in m/s^2."""
@@ -98,11 +102,7 @@ def pedals(
     needed = speed**2 / (2 * jnp.maximum(line, 0.1))
     stops = (line > -1.0) & (((signal[0] > 0) & (needed < CANNOT_STOP)) | ((signal[1] > 0) & (needed < truth["amber_limit"])))
     asked.append(jnp.where(stops, follow_the_leader(speed, wanted, line + 1.2, speed, headway=truth["headway"] / 2), 9.0))
-    grid = jnp.array(GRID)
-    way = at(stations, points, grid)
-    step = jnp.diff(way, axis=0)
-    tangent = jnp.concatenate([step, step[-1:]])
-    tangent = tangent / jnp.sqrt(jnp.sum(tangent**2, axis=1, keepdims=True) + 1e-9)
+    way, tangent, grid = looked_at(stations, points)
     gap, closing = ahead_of_me(way, tangent, grid, users, speed)
     asked.append(jnp.min(follow_the_leader(speed, wanted, gap, closing, headway=truth["headway"])))
     clash = first_clash(way, grid, users, speed, route, truth["gap"])
@@ -111,14 +111,28 @@ def pedals(
     return jnp.clip(jnp.min(jnp.stack(asked)), -8.0, 2.5)
 
 
+def looked_at(stations: Array, points: Array) -> tuple[Float[Array, "grid 2"], Float[Array, "grid 2"], Float[Array, "grid"]]:
+    """Points of the way ahead, its direction there, and their stations, as far as others are looked for."""
+    grid = jnp.array(GRID)
+    way = at(stations, points, grid)
+    step = jnp.diff(way, axis=0)
+    tangent = jnp.concatenate([step, step[-1:]])
+    return way, tangent / jnp.sqrt(jnp.sum(tangent**2, axis=1, keepdims=True) + 1e-9), grid
+
+
 def speed_for_bends(stations: Array, points: Array, desired: Array) -> Float[Array, ""]:
     """The speed from which all bends ahead can still be taken at GRIP after braking at COMFORT."""
+    bend = bends(points)
+    allowed = jnp.sqrt(GRIP / jnp.maximum(bend, 1e-3) + 2 * COMFORT * jnp.maximum(0, stations[1:-1] - 2.0))
+    return jnp.minimum(desired, jnp.min(allowed))
+
+
+def bends(points: Array) -> Float[Array, "points-2"]:
+    """Curvature of the way at each point but the first and the last, 1/m."""
     legs = jnp.diff(points, axis=0)
     heading = jnp.arctan2(legs[:, 1], legs[:, 0])
     length = jnp.sqrt(jnp.sum(legs**2, axis=1) + 1e-6)
-    bend = jnp.abs(jnp.diff(heading)) / (0.5 * (length[1:] + length[:-1]))
-    allowed = jnp.sqrt(GRIP / jnp.maximum(bend, 1e-3) + 2 * COMFORT * jnp.maximum(0, stations[1:-1] - 2.0))
-    return jnp.minimum(desired, jnp.min(allowed))
+    return jnp.abs(jnp.diff(heading)) / (0.5 * (length[1:] + length[:-1]))
 
 
 def ahead_of_me(way: Array, tangent: Array, grid: Array, users: Array, speed: Array) -> tuple[Float[Array, "users"], Float[Array, "users"]]:
@@ -154,18 +168,8 @@ def first_clash(way: Array, grid: Array, users: Array, speed: Array, route: Arra
     People on foot always go first. Vehicles do where the route gives way, until it is clear of them.
     """
     mine = (-speed + jnp.sqrt(speed**2 + 2 * 1.5 * grid)) / 1.5
-    joins = route[9] > 1.5  # a stream of others, and needs room to get up to its speed
-    mine = jnp.maximum(mine, grid / jnp.where(joins, 4.5, 7.0))
+    mine = jnp.maximum(mine, grid / 7.0)
     after = jnp.array(AFTER)
-    entry = jnp.argmin(jnp.abs(grid - (route[8] + ENTERED)))
-
-    def beats_me_there(user: Array) -> Array:
-        """Whether somebody whose way bends, so that straight on says little, heads for where I join and is there about when I am."""
-        away, pace = way[entry] - user[1:3], jnp.sqrt(jnp.sum(user[5:7] ** 2) + 1e-6)
-        far = jnp.sqrt(jnp.sum(away**2) + 1e-6)
-        heads_there = jnp.sum(away * user[5:7]) > 0.2 * far * pace
-        eta = far / pace
-        return heads_there & (eta > mine[entry] - 0.8) & (eta < mine[entry] + margin + 0.5)
 
     def one(user: Array) -> Array:
         walks = user[9] > 0
@@ -173,11 +177,11 @@ def first_clash(way: Array, grid: Array, users: Array, speed: Array, route: Arra
         spots = user[1:3] + expected(user[5:7], user[10], after)
         reach = jnp.where(walks, CROSSES["walker"], CROSSES["vehicle"])
         meets = jnp.sqrt(jnp.sum((way[:, None] - spots) ** 2, axis=-1)) < reach  # (grid, after)
-        early, late = jnp.where(walks, 1.2, margin + jnp.where(joins, 1.0, 0.0)), jnp.where(walks, 1.0, 0.8)
+        early, late = jnp.where(walks, 1.2, margin), jnp.where(walks, 1.0, 0.8)
         when = (after > mine[:, None] - late - 0.4) & (after < mine[:, None] + early)
         same_way = jnp.sum(user[5:7] * jnp.array([1.0, 0.0])) > 0.8 * jnp.sqrt(jnp.sum(user[5:7] ** 2) + 1e-6)
-        goes_first = walks | jnp.where(joins, route[8] > PASSED, (route[9] > 0.5) & ~same_way)
-        clashes = jnp.any(meets & when, axis=1) | (joins & beats_me_there(user) & (jnp.arange(len(grid)) == entry))
+        goes_first = walks | ((route[9] > 0.5) & ~same_way)
+        clashes = jnp.any(meets & when, axis=1)
         return jnp.where((user[0] > 0) & moving & goes_first & jnp.any(clashes), grid[jnp.argmax(clashes)] - reach, 1e3)
 
     return jnp.min(jax.vmap(one)(users))

@@ -5,6 +5,7 @@ their way would have been, as fast. Nobody replayed comes behind them: they woul
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import jax
@@ -16,6 +17,7 @@ from rtc_mjx.physics.car import CAR
 from rtc_mjx.scenes.base import Actor
 from rtc_mjx.scenes.driver import expert_driver
 from rtc_mjx.scenes.driving import Driving
+from rtc_mjx.scenes.joining import Joint, join
 from rtc_mjx.scenes.several import crew
 from rtc_mjx.trajectory import Episode
 
@@ -33,10 +35,12 @@ class Generated(Driving):
     """
 
     speeds: ClassVar[tuple[float, float]]  # m/s, what the agent's drivers want on a free road
+    joint: ClassVar[Joint | None] = None  # where the agent's drivers join others who go first
 
     def expert(self, key: jax.Array, episode: Episode) -> tuple[Actor, Any]:
         """For each car a driver with a route and a temper of its own."""
-        drivers = self.each(lambda key, routes: expert_driver(key, self, routes, self.speeds))
+        pedals = partial(join, self.joint) if self.joint else None
+        drivers = self.each(lambda key, routes: expert_driver(key, self, routes, self.speeds, pedals))
         actors, truth = drivers(self.key_each(key), episode.context.routes)
         return crew(self, actors), truth
 

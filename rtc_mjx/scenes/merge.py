@@ -16,6 +16,7 @@ from rtc_mjx.geometry import resample
 from rtc_mjx.logs import NO_SIGNAL, VEHICLE, LoggedScene, RoadGraph
 from rtc_mjx.physics.car import CAR
 from rtc_mjx.scenes.generated import Generated, Traffic, assemble, moving
+from rtc_mjx.scenes.joining import Joint
 from rtc_mjx.scenes.roads import POINTS, as_segments, beside, bezier, straight, thinned
 from rtc_mjx.scenes.routes import RouteOptions
 from rtc_mjx.scenes.traffic import Drivers, drive, nothing_to_stop_for
@@ -43,6 +44,7 @@ class Merge(Generated):
 
     name: ClassVar[str] = "merge"
     speeds: ClassVar[tuple[float, float]] = SPEED
+    joint: ClassVar[Joint | None] = Joint(taken=-1.0, joined=JOIN)
     settings: ClassVar[str] = "intersection"
     route_options: ClassVar[RouteOptions] = RouteOptions(count=2, lanes=4)
 

@@ -11,12 +11,13 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 from jax import random
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Float, Int
 
 from rtc_mjx.geometry import resample, rotate
-from rtc_mjx.logs import NO_SIGNAL, VEHICLE, LoggedScene, RoadGraph
+from rtc_mjx.logs import NO_SIGNAL, RED, VEHICLE, LoggedScene, RoadGraph
 from rtc_mjx.physics.car import CAR
 from rtc_mjx.scenes.generated import Generated, Traffic, assemble, moving
+from rtc_mjx.scenes.joining import Joint
 from rtc_mjx.scenes.roads import arc, as_segments, beside, bezier, straight, thinned
 from rtc_mjx.scenes.routes import RouteOptions
 from rtc_mjx.scenes.traffic import Drivers, drive, nothing_to_stop_for
@@ -32,6 +33,11 @@ SPEED = (7.0, 11.0)  # m/s, what the agent's driver wants on a free road
 CIRCLING = (4.6, 5.6)  # m/s, what the others want: not faster than one who has just joined
 IN, ENTRY, SHORT, LONG, EXIT, OUT = range(6)  # lanes of an arm: in, onto the ring, to the next exit, past it to the next entry, off, out
 FROM = (3, 3, 3, 1, 2)  # arms that traffic comes from: nobody's way crosses another's
+JOINED = 14.0  # m past a give-way line, where the way onto the ring has become the ring
+HASTE = 8.0  # m/s, than which nobody who is driven is faster here
+SLOWLY = 4.2  # m/s, how fast the others take the bend onto the ring at least
+BEFORE = 1.5  # s by which they join before somebody who is driven could be there
+LATE = 3.0  # m from nose to give-way line, from where nobody stops before it
 PRESENT = (0.75, 0.65, 0.5, 0.6, 0.6)
 LAST = (3, 4, 2)  # in the traffic: the last that comes from the east, the north, the west
 
@@ -49,6 +55,7 @@ class Roundabout(Generated):
     name: ClassVar[str] = "roundabout"
     room: ClassVar[int] = 1 + len(LAST)
     speeds: ClassVar[tuple[float, float]] = SPEED
+    joint: ClassVar[Joint | None] = Joint(taken=8.0, joined=JOINED)
     settings: ClassVar[str] = "intersection"
     route_options: ClassVar[RouteOptions] = RouteOptions(lanes=9)
 
@@ -63,7 +70,7 @@ class Roundabout(Generated):
         pose = jnp.stack([jnp.array(WIDTH / 2), -radius - MOUTH - back - CAR[0] / 2, jnp.array(jnp.pi / 2)])
         signals = jnp.full((times, road.lanes.shape[0]), NO_SIGNAL)
         taken = jnp.array(LAST[: self.controlled - 1], int)
-        return assemble(road, signals, pose, speed, traffic(who, road, times), taken, times)
+        return assemble(road, signals, pose, speed, traffic(who, road, radius, back + CAR[0] / 2, taken, times), taken, times)
 
 
 def ring(radius: Array) -> RoadGraph:
@@ -108,8 +115,29 @@ def ring(radius: Array) -> RoadGraph:
     return RoadGraph(every, successors, gives_way, edges, jnp.ones(len(edges), bool), jnp.zeros((1, 4, 2)))
 
 
-def traffic(key: jax.Array, road: RoadGraph, times: int) -> Traffic:
-    """Poses, velocities, sizes and kinds of those who circulate: from the west past the agent's entry, and elsewhere."""
+def gives_way(
+    driven: Float[Array, "cars"], whence: Int[Array, "cars"], others: Float[Array, "users"], arms: Int[Array, "users"], radius: Array
+) -> Bool[Array, "users"]:
+    """Whether others do not join the ring before somebody who is driven and may pass their arm could be there.
+
+    Args:
+        driven: m to the give-way line of each car that is driven.
+        whence: their arms.
+        others: m to their own give-way lines.
+        arms: their arms.
+        radius: of the ring, m.
+    """
+    turns = (arms - whence[:, None]) % 4
+    soonest = (driven[:, None] + JOINED + turns * radius * jnp.pi / 2) / HASTE
+    passes = (turns == 1) | (turns == 2)  # at the third arm everybody has left
+    return jnp.any(passes & ((others + JOINED) / SLOWLY + BEFORE > soonest), axis=0)
+
+
+def traffic(key: jax.Array, road: RoadGraph, radius: Array, back: Array, taken: Int[Array, "more"], times: int) -> Traffic:
+    """Poses, velocities, sizes and kinds of those who circulate: from the west past the agent's entry, and elsewhere.
+
+    The agent's middle is `back` m from its give-way line; those that are taken are driven too.
+    """
     keys = iter(random.split(key, 6))
     count, arms = len(FROM), jnp.array(FROM)
 
@@ -127,12 +155,16 @@ def traffic(key: jax.Array, road: RoadGraph, times: int) -> Traffic:
     first = ARM + random.uniform(next(keys), (count,), minval=-30.0, maxval=30.0)
     gaps = random.uniform(next(keys), (count,), minval=10.0, maxval=30.0)
     station = first.at[1].set(first[0] - gaps[1]).at[2].set(first[0] - gaps[1] - gaps[2])
+    waits = gives_way(jnp.append(back, ARM - station[taken]), jnp.append(0, arms[taken]), ARM - station, arms, radius)
+    free = nothing_to_stop_for(count, times)
+    signals = jnp.where(waits, RED, free["signals"])  # nobody in the ring reacts to them, so they wait until the end
     drivers = Drivers(
         paths=paths, station=station, speed=desired, desired=desired,
         headway=random.uniform(next(keys), (count,), minval=1.0, maxval=1.8), length=length, leader=jnp.array([-1, 0, 1, -1, -1]),
-        until=jnp.full(count, 1e3), **nothing_to_stop_for(count, times),
+        until=jnp.full(count, 1e3), **{**free, "stop": jnp.full(count, ARM), "signals": signals},
     )  # fmt: skip
-    present = random.bernoulli(next(keys), jnp.array(PRESENT))
+    late = waits & (ARM - station < length / 2 + LATE)
+    present = random.bernoulli(next(keys), jnp.array(PRESENT)) & ~late  # nobody is where it can neither wait nor go
     poses, speeds = drive(drivers, 2.0, times)
     sizes = jnp.stack([length, jnp.full(count, 1.9)], axis=1)
     return moving(poses, speeds, sizes, jnp.where(present, VEHICLE, 0))
