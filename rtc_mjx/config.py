@@ -388,6 +388,15 @@ def write(config: Config, folder: Path) -> None:
     write_whole(folder / "config.json", json.dumps(to_dict(config), indent=1) + "\n")
 
 
+SEEDS = ("seeds", "first_seed")  # which trainings; all other settings say what each of them does
+
+
+def differing(ours: Config, theirs: Config) -> list[tuple[str, Any, Any]]:
+    """The settings in which two runs differ, of those that the method of the second reads, with the values of both."""
+    one, other = (flat(to_dict(held)) for held in (ours, theirs))
+    return [(name, one[name], other.get(name)) for name in one if one[name] != other.get(name) and name not in unread(theirs.method)]
+
+
 def unread(method: str) -> frozenset[str]:
     """Settings that a method does not read: two runs of it that differ in these are alike."""
     return frozenset() if "value" in METHODS[method_name(method)].parts else frozenset(OF_VALUE)

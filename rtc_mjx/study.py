@@ -4,7 +4,8 @@
     -> tables and figures of all that is in results/<name> (`rtc_mjx.report`)
 
 All seeds of an entry are one program. What is finished is not done again, so a study that was stopped at any moment goes on where it
-was, and ends with the numbers of one that was never stopped. Results of other commands in the same folder stay beside them.
+was, and ends with the numbers of one that was never stopped; with more `--seeds` than before it trains those that are missing. Results of
+other commands in the same folder stay beside them.
 """
 
 import argparse
@@ -20,7 +21,7 @@ from rich.markdown import Markdown
 
 from rtc_mjx import cache, cli, config, report, results, train
 from rtc_mjx.cluster import joined
-from rtc_mjx.entry import COMMAND, Entry, check_same, complete, evaluated, resolved
+from rtc_mjx.entry import COMMAND, Entry, check_there, complete, evaluated, resolved
 from rtc_mjx.errors import DivergedError, RunError, UsageError
 from rtc_mjx.methods import METHODS, method_name
 from rtc_mjx.runs import Run
@@ -103,19 +104,19 @@ def collected(wanted: Sequence[Entry], scene: str, folder: Path) -> dict[str, Ru
     """Runs of the study that are evaluated at their last update, of this command and of others before it.
 
     Raises:
-        UsageError: a run of an entry has other settings than the entry.
+        UsageError: a run of an entry has other settings than the entry, or seeds beside those of the entry.
     """
-    settings = {entry.name: resolved(entry, scene) for entry in wanted}
+    settings = {entry.name: resolved(entry, scene, "--run", str(folder / entry.name)) for entry in wanted}
     ours = next(iter(settings.values())).scene
+    for held in settings.values():
+        check_there(held)
     found = {}
     for place in sorted(folder.iterdir()) if folder.is_dir() else []:
         if not (place / "config.json").is_file():
             continue
         try:
             run = Run.open(place)
-            if place.name in settings:
-                check_same(settings[place.name], run)
-            elif run.config.scene != ours or run.config.method != place.name.partition(",")[0]:
+            if place.name not in settings and (run.config.scene != ours or run.config.method != place.name.partition(",")[0]):
                 continue  # not of this study
             if evaluated(run, now=False):
                 found[place.name] = run

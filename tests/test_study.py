@@ -332,7 +332,7 @@ def test_results_of_another_command_stay_and_those_there_are_shown_before_anythi
     ("options", "named"),
     [
         (["--losses.cloning", "2.0"], r"--losses\.cloning 2\.0 is wanted.*has 1\.0"),
-        (["--first-seed", "5"], "--first-seed 5 is wanted.*has 0"),
+        (["--first-seed", "5"], "--first-seed 5 --seeds 2 is wanted.*has seeds 0 to 1"),
         (["--updates", "8"], "--updates 8 is wanted.*has 4"),
     ],
 )
