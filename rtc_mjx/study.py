@@ -101,7 +101,7 @@ def alone(folder: Path) -> Iterator[None]:
 
 
 def collected(wanted: Sequence[Entry], scene: str, folder: Path) -> dict[str, Run]:
-    """Runs of the study that are evaluated at their last update, of this command and of others before it.
+    """Runs of the study that have all their seeds and are evaluated at their last update, of this command and of others before it.
 
     Raises:
         UsageError: a run of an entry has other settings than the entry, or seeds beside those of the entry.
@@ -118,6 +118,8 @@ def collected(wanted: Sequence[Entry], scene: str, folder: Path) -> dict[str, Ru
             run = Run.open(place)
             if place.name not in settings and (run.config.scene != ours or run.config.method != place.name.partition(",")[0]):
                 continue  # not of this study
+            if place.name in settings and run.config.all_seeds != settings[place.name].all_seeds:
+                continue  # others are to come: a result that is there may be of all
             if evaluated(run, now=False):
                 found[place.name] = run
         except UsageError as error:
@@ -132,7 +134,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = cli.Parser(prog=COMMAND, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
     parser.add_argument("--scene", required=True, metavar="NAME", help="the scene")
     parser.add_argument("--methods", metavar="A,B", help="methods, separated by commas (default: all that run on the scene)")
-    parser.add_argument("--seeds", type=int, default=20, metavar="N", help="seeds of each entry, trained in one program (default: 20)")
+    parser.add_argument("--seeds", type=int, default=20, metavar="N", help="seeds of each entry; those there are kept (default: 20)")
     parser.add_argument("--ablations", action="store_true", help=f"also vary the parts of RTC: {', '.join(VARIATIONS)}")
     parser.add_argument("--results", type=Path, required=True, metavar="DIR", help="tables and figures go to DIR/<name>; made if absent")
     parser.add_argument("--name", metavar="NAME", help="of the study, where a scene has several (default: the scene's)")

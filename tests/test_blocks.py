@@ -203,6 +203,13 @@ def test_blocks_that_wait_are_checked_before_anything_is_trained(again, monkeypa
     assert blocks.place(bc(again), range(2, 6)).is_dir()
 
 
+def test_a_result_of_some_seeds_does_not_replace_one_of_all(some):
+    def shown(seeds):
+        return set(study.collected([entry.Entry("bc", "bc", ("--seeds", str(seeds), *SMALL))], "double_goal", bc(some).parent))
+
+    assert shown(2) == {"bc"} and shown(3) == set()
+
+
 def test_what_is_not_blocks_of_one_training_is_not_joined(again, some, tmp_path):
     run = Run.open(bc(again))
     for seeds, changes, named in (
