@@ -17,6 +17,14 @@ Held = Mapping[str, Record]
 FAMILIES = ("bc", "gail", "mgail", "info_mgail", "symphony", "naive_hierarchy", "rtc")
 MARKERS = dict(zip(FAMILIES, "sPv^DXo", strict=True))
 COLOURS = dict(zip(FAMILIES, ("0.45", "#8c6d31", "#d95f02", "#e7298a", "#66a61e", "#7570b3", "#1b6fb0"), strict=True))
+SOURCES: Mapping[
+    str, tuple[str, dict[str, Any]]
+] = {  # of types: whose, and how they are drawn; each has less of the episode than those above
+    "paired": ("the episode's own expert", {"marker": "o", "color": "k", "markerfacecolor": "k"}),
+    "same_xi": ("another expert in the same episode", {"marker": "^", "color": "k", "markerfacecolor": "white"}),
+    "shuffled": ("an expert in another episode", {"marker": "s", "color": "#d95f02", "markerfacecolor": "#d95f02"}),
+    "prior": ("the prior", {"marker": "D", "color": "#1b6fb0", "markerfacecolor": "white"}),
+}
 SMALLEST = 1e-5  # on logarithmic axes; what is less is drawn there
 UNITS = {
     "return": "steps at a goal",
@@ -175,6 +183,47 @@ def overview(held: Held, file: Path) -> None:
     save(canvas, file)
 
 
+def type_shift(held: Held, file: Path) -> None:
+    """Main metrics of each method that reads types off trajectories, by where its types come from: means, and seeds as small points."""
+    found = {name: record["type_shift"]["types"] for name, record in held.items() if record.get("type_shift", {}).get("types")}
+    if not found:
+        return
+    first = held[next(iter(found))]
+    main = [n for n in scene_type(first["scene"]).main_metrics if all(n in values for of in found.values() for values in of.values())]
+    columns = min(2, len(main))
+    rows = -(-len(main) // columns)
+    canvas = Figure(figsize=(3.4 * columns + 1.2, (0.62 * len(found) + 0.5) * rows + 0.9), layout="constrained")
+    panels = canvas.subplots(rows, columns, squeeze=False, sharey=True)
+    for axis, metric in zip(panels.flat, main, strict=False):
+        if logarithmic(metric):
+            axis.set_xscale("symlog", linthresh=1e-3)
+        for place, of in enumerate(found.values()):
+            _by_source(axis, place, {source: of[source][metric] for source in SOURCES if source in of})
+        axis.axvline(first["reference"]["expert"][metric], color="k", linestyle=":", linewidth=1, label="what experts do")
+        if logarithmic(metric):
+            axis.set_xlim(left=-2e-4)  # nothing is below 0, where points are seen whole
+        axis.set_title(titled(metric), fontsize=9)
+        _rows(axis, list(found))
+        for below in range(1, len(found)):
+            axis.axhline(below - 0.5, color="0.85", linewidth=0.6, zorder=1)
+    for axis in panels.flat[len(main) :]:
+        axis.axis("off")
+    marks = dict(zip(*reversed(panels[0, 0].get_legend_handles_labels()), strict=True))
+    canvas.legend(marks.values(), marks, ncols=2, loc="outside upper center", fontsize=8, frameon=False)
+    save(canvas, file)
+
+
+def _by_source(axis: Axes, place: int, values: Mapping[str, Sequence[float]]) -> None:
+    """One method's row: a line for each source of types, their means joined."""
+    heights = [place + 0.19 * (list(SOURCES).index(source) - (len(SOURCES) - 1) / 2) for source in values]
+    means = [float(np.mean(seeds)) for seeds in values.values()]
+    axis.plot(means, heights, color="0.6", linewidth=0.8, zorder=2)
+    for (source, seeds), height, mean in zip(values.items(), heights, means, strict=True):
+        label, how = SOURCES[source]
+        axis.plot(seeds, [height] * len(seeds), ".", color=how["color"], markersize=3.5, alpha=0.6, zorder=3)
+        axis.plot(mean, height, **how, linestyle="", markersize=6, label=f"types of {label}", zorder=4)
+
+
 def ablations(held: Held, file: Path) -> None:
     """A panel for each option and metric: seeds as dots, means joined; the committed value stands in every panel, filled.
 
@@ -257,8 +306,13 @@ def realism(held: Held, file: Path) -> None:
             axis.plot([of[feature]["floor"]] * 2, [place - 0.4, place + 0.4], "k--", linewidth=1)
         axis.set_title(feature.replace("_", " "), fontsize=9)
         axis.set_xlabel("JSD (bit); dashed: floor", fontsize=8)
-        axis.set_yticks(range(len(found)), list(found), fontsize=8)
-        axis.tick_params(axis="x", labelsize=7)
-        axis.grid(alpha=0.25, axis="x")
-        axis.set_ylim(len(found) - 0.4, -0.6)
+        _rows(axis, list(found))
     save(canvas, file)
+
+
+def _rows(axis: Axes, names: Sequence[str]) -> None:
+    """A row for each name, the first at the top."""
+    axis.set_yticks(range(len(names)), names, fontsize=8)
+    axis.tick_params(axis="x", labelsize=7)
+    axis.grid(alpha=0.25, axis="x")
+    axis.set_ylim(len(names) - 0.4, -0.6)

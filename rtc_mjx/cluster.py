@@ -116,6 +116,7 @@ def joined(options: Hardware, told: Mapping[str, Any]) -> Iterator[Team]:
         initialization_timeout=patience, heartbeat_timeout_seconds=patience,
     )  # fmt: skip
     try:
+        jax.devices()  # devices are found by all processes together: the first may be the only one to need them for a while
         yield team
         team.exchange(None, last=True)
     except BaseException as error:

@@ -1,8 +1,8 @@
 """Tables and figures of results: `python -m rtc_mjx.report results/double_goal` makes all of them again, from the JSON files alone.
 
 `python -m rtc_mjx.report RUN... --out DIR` first takes the results of runs: a JSON file a method, then the same tables and figures:
-table.md, comparisons.md, claims.md, type_shift.md, conditional_realism.md, ablations.md, curves.png, overview.png, conditional_realism.png,
-ablations.png, as far as there is something to show. Beside results of several scenes, claims.md of all of them.
+table.md, comparisons.md, claims.md, type_shift.md, conditional_realism.md, ablations.md, curves.png, overview.png, type_shift.png,
+conditional_realism.png, ablations.png, as far as there is something to show. Beside results of several scenes, claims.md of all of them.
 """
 
 import argparse
@@ -63,6 +63,7 @@ def draw(whole: Mapping[str, Record], folder: Path) -> None:
     if methods:
         charts.curves(methods, folder / "curves.png")
         charts.overview(methods, folder / "overview.png")
+        charts.type_shift(methods, folder / "type_shift.png")
     charts.realism(methods, folder / "conditional_realism.png")
     charts.ablations(whole, folder / "ablations.png")
 

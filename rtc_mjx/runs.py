@@ -1,5 +1,7 @@
 """A run directory: config.json, metrics.jsonl, TensorBoard files, checkpoints/, media/, evaluation.json. It describes itself.
 
+A run that was joined from others (`rtc_mjx.blocks`) has these in blocks/, with their TensorBoard files.
+
 A checkpoint is written beside and renamed when complete (orbax), with a digest of its numbers; the last few are kept. What a
 crash cuts short is a checkpoint without its name or a last line of metrics.jsonl: both are taken away on resuming.
 """

@@ -4,7 +4,8 @@
     -> tables and figures of all that is in results/<name> (`rtc_mjx.report`)
 
 All seeds of an entry are one program. What is finished is not done again, so a study that was stopped at any moment goes on where it
-was, and ends with the numbers of one that was never stopped. Results of other commands in the same folder stay beside them.
+was, and ends with the numbers of one that was never stopped; with more `--seeds` than before it trains those that are missing. Results of
+other commands in the same folder stay beside them.
 """
 
 import argparse
@@ -20,7 +21,7 @@ from rich.markdown import Markdown
 
 from rtc_mjx import cache, cli, config, report, results, train
 from rtc_mjx.cluster import joined
-from rtc_mjx.entry import COMMAND, Entry, check_same, complete, evaluated, resolved
+from rtc_mjx.entry import COMMAND, Entry, check_there, complete, evaluated, resolved
 from rtc_mjx.errors import DivergedError, RunError, UsageError
 from rtc_mjx.methods import METHODS, method_name
 from rtc_mjx.runs import Run
@@ -100,23 +101,25 @@ def alone(folder: Path) -> Iterator[None]:
 
 
 def collected(wanted: Sequence[Entry], scene: str, folder: Path) -> dict[str, Run]:
-    """Runs of the study that are evaluated at their last update, of this command and of others before it.
+    """Runs of the study that have all their seeds and are evaluated at their last update, of this command and of others before it.
 
     Raises:
-        UsageError: a run of an entry has other settings than the entry.
+        UsageError: a run of an entry has other settings than the entry, or seeds beside those of the entry.
     """
-    settings = {entry.name: resolved(entry, scene) for entry in wanted}
+    settings = {entry.name: resolved(entry, scene, "--run", str(folder / entry.name)) for entry in wanted}
     ours = next(iter(settings.values())).scene
+    for held in settings.values():
+        check_there(held)
     found = {}
     for place in sorted(folder.iterdir()) if folder.is_dir() else []:
         if not (place / "config.json").is_file():
             continue
         try:
             run = Run.open(place)
-            if place.name in settings:
-                check_same(settings[place.name], run)
-            elif run.config.scene != ours or run.config.method != place.name.partition(",")[0]:
+            if place.name not in settings and (run.config.scene != ours or run.config.method != place.name.partition(",")[0]):
                 continue  # not of this study
+            if place.name in settings and run.config.all_seeds != settings[place.name].all_seeds:
+                continue  # others are to come: a result that is there may be of all
             if evaluated(run, now=False):
                 found[place.name] = run
         except UsageError as error:
@@ -131,7 +134,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = cli.Parser(prog=COMMAND, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
     parser.add_argument("--scene", required=True, metavar="NAME", help="the scene")
     parser.add_argument("--methods", metavar="A,B", help="methods, separated by commas (default: all that run on the scene)")
-    parser.add_argument("--seeds", type=int, default=20, metavar="N", help="seeds of each entry, trained in one program (default: 20)")
+    parser.add_argument("--seeds", type=int, default=20, metavar="N", help="seeds of each entry; those there are kept (default: 20)")
     parser.add_argument("--ablations", action="store_true", help=f"also vary the parts of RTC: {', '.join(VARIATIONS)}")
     parser.add_argument("--results", type=Path, required=True, metavar="DIR", help="tables and figures go to DIR/<name>; made if absent")
     parser.add_argument("--name", metavar="NAME", help="of the study, where a scene has several (default: the scene's)")

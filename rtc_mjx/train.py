@@ -188,7 +188,7 @@ def check_finite(line: dict[str, Any], run: Run) -> None:
     """Raises DivergedError where a seed has diverged: going on would only write NaN."""
     bad = [(name, seed) for name, x in line.items() if isinstance(x, list) for seed, v in enumerate(x) if not math.isfinite(v)]
     if bad:
-        name, seed = bad[0]
+        name, seed = bad[0][0], run.config.first_seed + bad[0][1]
         whole = next(run.checkpoints(), None)
         kept = f"the last checkpoint is of update {whole}" if whole is not None else "there is no checkpoint yet"
         raise DivergedError(

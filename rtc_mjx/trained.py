@@ -7,7 +7,7 @@ from rtc_mjx.config import Config
 from rtc_mjx.learner import Learner
 from rtc_mjx.models import Networks
 from rtc_mjx.runs import Run
-from rtc_mjx.updates import start_shapes
+from rtc_mjx.updates import TrainState, start_shapes
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,17 @@ class Trained:
 
 
 def trained(run: Run) -> Trained:
-    """Loads the run's last whole checkpoint.
+    """Loads what the run's last whole checkpoint holds of the networks.
+
+    Raises:
+        UsageError: it has none; or the recordings it learned from are not there any more.
+    """
+    learner, update, state, _ = restored(run)
+    return Trained(run.config, learner, state.networks, update)
+
+
+def restored(run: Run) -> tuple[Learner, int, TrainState, float]:
+    """What was trained, and the run's last whole checkpoint: its update, its state, and the seconds spent until then.
 
     Raises:
         UsageError: it has none; or the recordings it learned from are not there any more.
@@ -36,5 +46,4 @@ def trained(run: Run) -> Trained:
     config = run.config
     run.check_recordings()
     learner = config.learner(dataset.statistics(config.scene, dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN)))
-    update, state, _ = run.restore(start_shapes(learner, config.all_seeds))
-    return Trained(config, learner, state.networks, update)
+    return learner, *run.restore(start_shapes(learner, config.all_seeds))

@@ -248,6 +248,24 @@ def test_what_types_carry_and_conditional_realism_have_a_row_for_every_method():
     assert [line.split(" | ")[2].strip(" |") for line in realism if line.startswith(("| bc", "| rtc_c"))] == ["0.05", "0.05"]
 
 
+def test_the_figure_of_type_shift_has_every_seed_under_every_source_of_types(tmp_path, monkeypatch):
+    held = {name: record(name, prior={"return": [11.0] * 4}) for name in ("bc", "rtc_c", "rtc_d")}
+    held |= {name: held[name] | {"type_shift": shift_of()} for name in ("rtc_c", "rtc_d")}
+    for of in held.values():
+        of["reference"] = {"expert": {"return": 31.0}}
+    drawn = []
+    monkeypatch.setattr(charts, "save", lambda canvas, file: drawn.append(canvas))
+    charts.type_shift(held, tmp_path / "type_shift.png")
+    axis = drawn[0].axes[0]
+    points = sorted(x for line in axis.lines if line.get_marker() == "." for x in line.get_xdata())
+    assert points == [11.0] * 8 + [12.0] * 8 + [30.0] * 16
+    assert [label.get_text() for label in axis.get_yticklabels()] == ["rtc_c", "rtc_d"]  # bc reads no types off trajectories
+    heights = [line.get_ydata()[0] for line in axis.lines if line.get_marker() == "."]
+    assert len(set(heights)) == 8
+    charts.type_shift({"bc": held["bc"]}, tmp_path / "type_shift.png")
+    assert len(drawn) == 1 and len(drawn[0].axes) == 1  # the goals' divergence was not measured
+
+
 # Studies
 
 
@@ -332,7 +350,7 @@ def test_results_of_another_command_stay_and_those_there_are_shown_before_anythi
     ("options", "named"),
     [
         (["--losses.cloning", "2.0"], r"--losses\.cloning 2\.0 is wanted.*has 1\.0"),
-        (["--first-seed", "5"], "--first-seed 5 is wanted.*has 0"),
+        (["--first-seed", "5"], "--first-seed 5 --seeds 2 is wanted.*has seeds 0 to 1"),
         (["--updates", "8"], "--updates 8 is wanted.*has 4"),
     ],
 )

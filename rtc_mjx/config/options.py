@@ -15,6 +15,7 @@ from rtc_mjx.methods import METHODS, method_name
 from rtc_mjx.models import ModelOptions, Statistics
 from rtc_mjx.scenes import DoubleGoal, Scene
 
+SEEDS = ("seeds", "first_seed")  # which trainings; all other settings say what each of them does
 OF_VALUE = (  # read by methods with a V, and by no other
     *("losses.policy_gradient", "losses.policy_gradient_start", "losses.policy_gradient_ramp", "losses.value"),
     *("optimiser.value_rate", "optimiser.discount", "optimiser.trace"),
@@ -129,6 +130,12 @@ def flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     for key, value in table.items():
         out |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
     return out
+
+
+def differing(ours: Config, theirs: Config) -> list[tuple[str, Any, Any]]:
+    """The settings in which two runs differ, of those that the method of the second reads, with the values of both."""
+    one, other = (flat(to_dict(held)) for held in (ours, theirs))
+    return [(name, one[name], other.get(name)) for name in one if one[name] != other.get(name) and name not in unread(theirs.method)]
 
 
 def unread(method: str) -> frozenset[str]:
