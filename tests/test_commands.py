@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rtc_mjx import benchmark
+from rtc_mjx import benchmark, config
 from rtc_mjx.errors import UsageError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -82,6 +82,19 @@ def test_wrong_use_leaves_with_status_2_and_one_line():
         assert done.returncode == 2
         assert len(done.stderr.strip().splitlines()) == 1
         assert options[-1] in done.stderr
+
+
+def test_what_experts_do_is_told_with_intervals(capsys):
+    from rtc_mjx import experts
+
+    experts.main(["--scene", "double_goal", "--episodes", "64", "--scene.steps", "20"])
+    table = dict(line.split("│")[1:3] for line in capsys.readouterr().out.splitlines() if line.startswith("│"))
+    assert {name.strip() for name in table} == {"return", "jsd_goal", "jsd_goal_and_turn", "lower"}
+    found, notes = experts.told(config.from_command_line(["--scene", "double_goal", "--scene.steps", "20", "--experts.test", "64"], "told"))
+    assert all(low <= value <= high for value, low, high, _ in found.values()) and not notes
+    assert {name.strip(): float(value) for name, value in table.items()} == pytest.approx({n: v[0] for n, v in found.items()}, rel=1e-3)
+    with pytest.raises(UsageError, match="episodes 1"):
+        experts.main(["--scene", "double_goal", "--episodes", "1"])
 
 
 def test_help_explains_and_nothing_else_is_printed():
