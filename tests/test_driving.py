@@ -20,7 +20,8 @@ from rtc_mjx.models import ModelOptions
 from rtc_mjx.physics import PhysicsState, specialised_step, substates
 from rtc_mjx.rollout import rollout
 from rtc_mjx.scenes import SCENES, Actor, split_items
-from rtc_mjx.scenes.driving import AWAY, CAR, OWN, crossings, nearest_users, ran_red
+from rtc_mjx.scenes.conduct import crossings, ran_red
+from rtc_mjx.scenes.driving import AWAY, CAR, OWN, nearest_users
 from rtc_mjx.scenes.generated import Generated
 from rtc_mjx.scenes.intersection import cycle
 from rtc_mjx.scenes.routes import BEHIND, NOWHERE, RouteOptions, find_routes

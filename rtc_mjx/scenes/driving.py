@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rtc_mjx import metrics
 from rtc_mjx.errors import UsageError
-from rtc_mjx.geometry import boxes_overlap, capsule_gap, corners, off_road, project, rotate
+from rtc_mjx.geometry import boxes_overlap, capsule_gap, corners, project, rotate
 from rtc_mjx.logs import GREEN, RATE, RED, LoggedScene, RoadGraph
 from rtc_mjx.logs.picture import draw_road
 from rtc_mjx.physics import PhysicsState, Surroundings, World, load, rest_state, specialised_step, substates
@@ -30,15 +30,15 @@ from rtc_mjx.physics.car import CAR, CONTROL_UNIT
 from rtc_mjx.pytree import pytree
 from rtc_mjx.scenes import scenery
 from rtc_mjx.scenes.base import Features, ItemSet, Ranges, Scene
+from rtc_mjx.scenes.conduct import conduct, on_branches, past_edges, span
 from rtc_mjx.scenes.routes import SPACING, RouteOptions, Routes, find_routes
 from rtc_mjx.scenes.several import cars_apart, cars_together, the_others
-from rtc_mjx.scenes.sight import FAR, OFF_ROUTE, ROUTE, USER, Others, around_each, see_routes, see_users
+from rtc_mjx.scenes.sight import FAR, ROUTE, USER, Others, around_each, see_routes, see_users
 from rtc_mjx.trajectory import Demonstration, Episode, Trajectory
 
 CONTROL_EVERY = 3  # logged times a control step: 10 Hz to 3.3 Hz
 OWN = 4  # numbers of an observation about the car itself
 SAME_ROUTE = 0.05  # m, mean difference in distance from the path below which routes fit alike
-PAST = 1.0  # m past a stop line, from where it counts as crossed
 AWAY = 1e3  # m, where road users wait that are not there
 BINS = 100  # of the divergences (paper, section V-B)
 SAMPLES = 16  # K of minADE
@@ -191,7 +191,7 @@ class Driving(Scene):
 
     def ranges(self, expert: Features) -> Ranges:
         """Of the curvature where lanes branch, 1/m, and of progress, m."""
-        return {"curvature": span(_on_branches(expert)), "progress": span(expert["progress"])}
+        return {"curvature": span(on_branches(expert)), "progress": span(expert["progress"])}
 
     def dress(self, spec: mujoco.MjSpec, episode: Episode) -> None:
         """Kerbs, lanes, crosswalks, stop lines, and the ways that agents may go on."""
@@ -316,7 +316,7 @@ class Driving(Scene):
         """Of each car: collisions, time off the road, distance from the expert, progress, curvature where lanes branch, reds run."""
         episode = demonstration.episode
         expert = self.views(Demonstration(episode, demonstration.trajectory, ()))
-        return self.each(_features)(expert, self.apart(trajectory), *self.encounters(episode, trajectory))
+        return self.each(conduct)(expert, self.apart(trajectory), *self.encounters(episode, trajectory))
 
     def encounters(self, episode: Episode, trajectory: Trajectory) -> tuple[Bool[Array, "*agents others"], Bool[Array, "*agents others"]]:
         """Whether each car touched each of the others at any physics step: by contact of the collision capsules, and by overlap of boxes.
@@ -345,7 +345,7 @@ class Driving(Scene):
 
         A minimum is over the samples, for each agent by itself; all else counts each agent of each sample alike.
         """
-        here, there = (_on_branches(f) for f in (features, expert))
+        here, there = (on_branches(f) for f in (features, expert))
         limits, on_road = ranges or self.ranges(expert), features["may_leave_road"].astype(bool)
         return {
             "collision_rate": float(np.mean(features["collision"])),
@@ -364,39 +364,9 @@ def cars_among(cars: int, road_users: int) -> World:
     return load("driving", cars=cars, road_users=road_users)
 
 
-def _features(demonstration: Demonstration, trajectory: Trajectory, touch: Array, overlap: Array) -> dict[str, Array]:
-    """Of one car, which touched or overlapped some of the others."""
-    road, qpos = demonstration.episode.context, trajectory.states.qpos
-    past = jax.vmap(lambda q: jnp.any(past_edges(q[:3], road.graph) > 0))(qpos)
-    crossed = crossings(road.routes, qpos)
-    bend, branching = jax.vmap(lambda q: _bend(road.routes, q[:2]))(qpos)
-    return {
-        "collision": jnp.any(touch & ~road.ghosts),
-        "overlap": jnp.any(overlap & ~road.overlapped),
-        "offroad": jnp.mean(past),
-        "may_leave_road": jnp.any(road.graph.edge_valid) & ~road.starts_off_road,
-        "ade": jnp.mean(jnp.sqrt(jnp.sum((qpos - demonstration.trajectory.states.qpos)[:, :2] ** 2, axis=1))),
-        "progress": jnp.sqrt(jnp.sum((qpos[-1] - qpos[0])[:2] ** 2)),
-        "curvature": bend,
-        "branching": branching,
-        "ran_red": ran_red(road.routes, crossed),
-        "decided": jnp.any(crossed),
-    }
-
-
 def _at_times(routes: Routes, times: Int[Array, "times"]) -> Routes:
     """Routes with the signals of some of the logged times."""
     return dataclasses.replace(routes, signals=routes.signals[times])
-
-
-def span(values: np.ndarray) -> tuple[float, float]:
-    """The range of values, never empty."""
-    low, high = (float(np.min(values)), float(np.max(values))) if values.size else (0.0, 1.0)
-    return low, max(high, low + 1e-6)
-
-
-def _on_branches(features: dict[str, np.ndarray]) -> np.ndarray:
-    return features["curvature"][features["branching"].astype(bool)]
 
 
 def with_room_for(log: LoggedScene, count: int) -> LoggedScene:
@@ -419,32 +389,3 @@ def nearest_users(log: LoggedScene, count: int) -> tuple[Int[Array, "count"], In
     others = jnp.where(jnp.isin(jnp.arange(len(others)), log.controlled) | (log.kind == 0), jnp.inf, others)
     order = jnp.argsort(others)[:count]
     return order, jnp.maximum(0, jnp.sum(jnp.isfinite(others)) - count)
-
-
-def past_edges(pose: Float[Array, "3"], road: RoadGraph) -> Float[Array, "4"]:
-    """How far each corner of the car is past the nearest road edge, m; negative on the road."""
-    return jax.vmap(lambda corner: off_road(corner, road.edges, road.edge_valid))(corners(pose, jnp.array(CAR)))
-
-
-def _bend(routes: Routes, point: Float[Array, "2"]) -> tuple[Array, Array]:
-    """Curvature of the nearest lane, and whether lanes branch there."""
-    distance = jnp.where(routes.valid[:, None], jnp.sum((routes.paths - point) ** 2, axis=-1), jnp.inf)
-    route, index = jnp.unravel_index(jnp.argmin(distance), distance.shape)
-    return routes.curvature[route, index], routes.branching[route, index]
-
-
-def crossings(routes: Routes, qpos: Float[Array, "times 4"]) -> Bool[Array, "routes steps"]:
-    """When the car's nose crossed the stop line of each route it was on."""
-
-    def one(path: Array, stop: Array) -> Array:
-        station, aside, _ = jax.vmap(lambda q: project(path, SPACING, q[:2]))(qpos)
-        beyond = station + CAR[0] / 2 > stop + PAST
-        return ~beyond[:-1] & beyond[1:] & (jnp.abs(aside[1:]) < OFF_ROUTE / 2)
-
-    return jax.vmap(one)(routes.paths, routes.stop) & routes.valid[:, None]
-
-
-def ran_red(routes: Routes, crossed: Bool[Array, "routes steps"]) -> Bool[Array, ""]:
-    """Whether a stop line was crossed while its signal was red: all of them, where routes on which the car still is cross together."""
-    red = (routes.signals[:-1] == RED) & (routes.signals[1:] == RED)
-    return jnp.any(jnp.any(crossed, axis=0) & jnp.all(~crossed | red.T, axis=0))
