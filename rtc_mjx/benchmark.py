@@ -324,8 +324,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         _chosen("world", options.first_result, WORLDS)
         sys.stdout.write(f"{_first_result(options.first_result)}\n")
         return
-    if options.rounds < 1:
-        raise UsageError(f"--rounds {options.rounds}: at least 1 is needed")
+    cli.at_least(1, rounds=options.rounds)
     parts = _chosen("part", options.parts or ",".join(PARTS[: 2 if options.quick else 3]), PARTS)
     names = _chosen("world", options.worlds, WORLDS)
     batches = [64] if options.quick else _batches(options.batches)

@@ -127,8 +127,7 @@ def check(runs: Sequence[Run]) -> None:
         if run.config.first_seed != before.config.all_seeds.stop:
             raise UsageError(f"{run.folder} begins with seed {run.config.first_seed}: {before.config.all_seeds.stop} is needed")
         for name, theirs, ours in settings.differing(before.config, run.config):
-            if name not in settings.SEEDS:
-                raise UsageError(f"{run.folder} has {name} {ours}, {before.folder} has {theirs}: they are no blocks of one training")
+            raise UsageError(f"{run.folder} has {name} {ours}, {before.folder} has {theirs}: they are no blocks of one training")
     for run in runs:
         run.check_recordings()
 

@@ -3,6 +3,7 @@
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import NoReturn
 
 from rich.console import Console
@@ -18,6 +19,27 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Prints the message and leaves with status 2."""
         self.exit(2, f"{self.prog}: {message} (see --help)\n")
+
+
+def at_least(least: int, **options: int) -> None:
+    """Checks options by name, without their dashes.
+
+    Raises:
+        UsageError: one is smaller.
+    """
+    for name, value in options.items():
+        if value < least:
+            raise UsageError(f"--{name} {value}: at least {least} {'is' if least == 1 else 'are'} needed")
+
+
+def check_out(file: Path, ending: str) -> None:
+    """Checks `--out`: a file that is to be written.
+
+    Raises:
+        UsageError: its name ends otherwise, or its folder does not exist.
+    """
+    if file.suffix != ending or not file.absolute().parent.is_dir():
+        raise UsageError(f"--out {file}: a file name that ends in {ending}, in a folder that exists, is needed")
 
 
 def console() -> Console:

@@ -144,11 +144,9 @@ def check_same(wanted: Config, run: Run) -> None:
     """
     for name, ours, theirs in config.differing(wanted, run.config):
         option = f"--{name.replace('_', '-')}"
-        if name not in config.SEEDS:
-            raise UsageError(
-                f"{option} {ours} is wanted: the run in {run.folder} has {theirs}; give {option} {theirs}, "
-                "or another --name for another study"
-            )
+        raise UsageError(
+            f"{option} {ours} is wanted: the run in {run.folder} has {theirs}; give {option} {theirs}, or another --name for another study"
+        )
     ours, theirs = wanted.all_seeds, run.config.all_seeds
     if not blocks.inside(theirs, ours):
         both = range(min(ours.start, theirs.start), max(ours.stop, theirs.stop))

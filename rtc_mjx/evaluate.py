@@ -18,13 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 import rich.progress
 from jax import random
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 from rich.console import Console
 from rich.table import Table
 
 from rtc_mjx import cache, cli, dataset, metrics, reference
 from rtc_mjx.config import Config
-from rtc_mjx.errors import DivergedError, UsageError
+from rtc_mjx.errors import DivergedError
 from rtc_mjx.files import write_whole
 from rtc_mjx.keys import stream
 from rtc_mjx.learner import Learner
@@ -152,7 +152,7 @@ def evaluate(run: Run, episodes: int, watch: Watch = iter) -> dict[str, Any]:
     roll, shown = roller(learner, config.scene.samples, watch), dataset.without_truth(test)
     given = donors(learner.scene, learner.method, shown)
     features = roll(networks, shown, given, stream("evaluation", 0))
-    expert, second = (made(config.scene, episodes) for made in (reference.experts, reference.more_experts))
+    expert, second = reference.both(config.scene, episodes)
     table = score(config, features, expert)
     means = {source: _summaries(config, features[source], expert, table[source]) for source in table}
     scene = config.scene
@@ -217,19 +217,27 @@ def reactions(
 
 def _summaries(config: Config, features: Features, expert: Features, values: dict[str, list[float]]) -> dict[str, dict[str, Any]]:
     """Of each metric: per seed, mean, standard deviation, and a bootstrap interval of the mean over groups of test episodes."""
-    ranges, groups = config.scene.ranges(expert), config.scene.groups(next(iter(expert.values())).shape[1])
-
-    def means_over_seeds(rows: np.ndarray) -> np.ndarray:
-        theirs = {k: v[:, rows] for k, v in expert.items()}
-        drawn = [{k: v[i][:, rows] for k, v in features.items()} for i in range(config.seeds)]
-        return np.mean([list(config.scene.metrics(d, theirs, ranges).values()) for d in drawn], axis=0)
-
-    low, high = metrics.bootstrap(np.arange(len(groups)), means_over_seeds, draws=200, biased=True, groups=groups)
+    seeds = [{name: x[i] for name, x in features.items()} for i in range(config.seeds)]
+    low, high = intervals(config.scene, seeds, expert)
     out = {}
     for (name, per_seed), *interval in zip(values.items(), low, high, strict=True):
         spread = float(np.std(per_seed, ddof=1)) if len(per_seed) > 1 else 0.0
         out[name] = {"per_seed": per_seed, "mean": float(np.mean(per_seed)), "std": spread, "interval": [float(x) for x in interval]}
     return out
+
+
+def intervals(
+    scene: Scene, populations: Sequence[Features], expert: Features
+) -> tuple[Float[np.ndarray, "metrics"], Float[np.ndarray, "metrics"]]:
+    """Both ends of the 95 % interval, over groups of test episodes, of each metric's mean over populations (samples, episodes, ...)."""
+    ranges, groups = scene.ranges(expert), scene.groups(next(iter(expert.values())).shape[1])
+
+    def means(rows: np.ndarray) -> np.ndarray:
+        theirs = {k: v[:, rows] for k, v in expert.items()}
+        drawn = [{k: v[:, rows] for k, v in ours.items()} for ours in populations]
+        return np.mean([list(scene.metrics(d, theirs, ranges).values()) for d in drawn], axis=0)
+
+    return metrics.bootstrap(np.arange(len(groups)), means, draws=200, biased=True, groups=groups)
 
 
 def table(result: dict[str, Any]) -> Table:
@@ -277,8 +285,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--run", type=Path, required=True, metavar="DIR", help="the run directory; its last checkpoint is evaluated")
     parser.add_argument("--episodes", type=int, metavar="N", help="test episodes (default: experts.test of the run)")
     options = parser.parse_args(argv)
-    if options.episodes is not None and options.episodes < 4:
-        raise UsageError(f"--episodes {options.episodes}: at least 4 are needed")
+    if options.episodes is not None:
+        cli.at_least(4, episodes=options.episodes)
     cache.keep_compiled()
     run = Run.open(options.run)
     result = evaluate(run, options.episodes or run.config.experts.test, progress("rollouts"))

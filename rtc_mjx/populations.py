@@ -18,7 +18,7 @@ from rtc_mjx.charts import save
 from rtc_mjx.errors import UsageError
 from rtc_mjx.figures import episode_of, paths
 from rtc_mjx.render import poses, rollouts
-from rtc_mjx.runs import Run
+from rtc_mjx.runs import Run, by_method
 from rtc_mjx.scenes import Scene
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
@@ -40,18 +40,14 @@ def of_runs(runs: Sequence[Run], episodes: int, agents: int, seed_index: int = 0
     """The scene, the test demonstrations, and by name what each population does in them, experts first: (episodes, agents, ...).
 
     Raises:
-        UsageError: the runs are of different scenes, two have one name, or one has fewer seeds.
+        UsageError: the runs are of different scenes, two are of one method, or one has fewer seeds.
     """
-    scene = runs[0].config.scene
-    held: dict[str, Trajectory] = {}
+    named, scene = by_method(runs), runs[0].config.scene
     for run in runs:
-        name = run.config.method
         if run.config.scene != scene:
-            raise UsageError(f"{run.folder}: its scene is not that of {runs[0].folder}")
-        if name in held:
-            raise UsageError(f"{run.folder}: one run a method is needed; there are two of {name}")
-        if not 0 <= seed_index < run.config.seeds:
-            raise UsageError(f"--seed {seed_index}: {run.folder} has seeds 0 to {run.config.seeds - 1}")
+            raise UsageError(f"{run.folder}: its scene has other settings than that of {runs[0].folder}")
+    held = {}
+    for name, run in named.items():
         shown, held[name] = rollouts(run, episodes, agents, seed_index)
     return scene, shown, {"expert": experts(scene, shown, agents), **held}
 
@@ -93,11 +89,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--agents", type=int, default=24, help="lines in each cell (default %(default)s)")
     parser.add_argument("--seed", type=int, default=0, metavar="I", help="which of a run's seeds acts (default %(default)s)")
     options = parser.parse_args(argv)
-    if options.out.suffix != ".png" or not options.out.absolute().parent.is_dir():
-        raise UsageError(f"--out {options.out}: a file name that ends in .png, in a folder that exists, is needed")
-    for name in ("episodes", "agents"):
-        if getattr(options, name) < 1:
-            raise UsageError(f"--{name} {getattr(options, name)}: at least 1 is needed")
+    cli.check_out(options.out, ".png")
+    cli.at_least(1, episodes=options.episodes, agents=options.agents)
     runs = [Run.open(folder) for folder in options.runs]
     cache.keep_compiled()
     save(draw(*of_runs(runs, options.episodes, options.agents, options.seed)), options.out)

@@ -26,20 +26,24 @@ def expert_features(scene: Scene, test: Demonstration) -> Features:
 
 def experts(scene: Scene, count: int) -> Features:
     """Features of what agents are compared with: (experts, episodes, ...), as many experts an episode as an agent has rollouts."""
-    return _groups(scene, count)[0]
+    return both(scene, count)[0] if _driven_again(scene) else _alone(scene, count, dataset.TEST)
 
 
-def more_experts(scene: Scene, count: int) -> Features:
-    """Features of as many experts again: of the same episodes where an agent has several rollouts of each, of others elsewhere."""
-    return _groups(scene, count)[1]
+def both(scene: Scene, count: int) -> tuple[Features, Features]:
+    """`experts`, and as many experts again: of the same episodes where an agent has several rollouts of each, of others elsewhere."""
+    if not _driven_again(scene):
+        return _alone(scene, count, dataset.TEST), _alone(scene, count, dataset.SECOND_TEST)
+    held = _of_others(scene, count)
+    return {name: x[: scene.samples] for name, x in held.items()}, {name: x[scene.samples :] for name, x in held.items()}
 
 
-def _groups(scene: Scene, count: int) -> tuple[Features, Features]:
-    if scene.redrivable and scene.samples > 1:
-        both = _of_others(scene, count)
-        return {name: x[: scene.samples] for name, x in both.items()}, {name: x[scene.samples :] for name, x in both.items()}
-    first, second = (expert_features(scene, dataset.demonstrations(scene, count, seed)) for seed in (dataset.TEST, dataset.SECOND_TEST))
-    return {name: x[None] for name, x in first.items()}, {name: x[None] for name, x in second.items()}
+def _driven_again(scene: Scene) -> bool:
+    return scene.redrivable and scene.samples > 1
+
+
+def _alone(scene: Scene, count: int, seed: int) -> Features:
+    """One expert an episode: the demonstration's own."""
+    return {name: x[None] for name, x in expert_features(scene, dataset.demonstrations(scene, count, seed)).items()}
 
 
 def _of_others(scene: Scene, count: int) -> Features:

@@ -39,7 +39,13 @@ HOLD = 10  # frames for which the end of an episode stays
 
 
 def rollouts(run: Run, episodes: int, types: int, seed_index: int) -> tuple[Demonstration, Trajectory]:
-    """Test demonstrations, and rollouts of the run's last checkpoint in each under `types` draws of its test types."""
+    """Test demonstrations, and rollouts of the run's last checkpoint in each under `types` draws of its test types.
+
+    Raises:
+        UsageError: the run has fewer seeds.
+    """
+    if not 0 <= seed_index < run.config.seeds:
+        raise UsageError(f"--seed {seed_index}: {run.folder} has seeds 0 to {run.config.seeds - 1}")
     held = trained(run)
     config, learner = held.config, held.learner
     test = dataset.demonstrations(config.scene, config.experts.test, dataset.TEST)
@@ -189,13 +195,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     run = Run.open(options.run)
     out = options.out or run.folder / "media" / f"{options.camera}.mp4"
     size = _size(options.size)
-    if out.suffix != ".mp4" or not out.absolute().parent.is_dir():
-        raise UsageError(f"--out {out}: a file name that ends in .mp4, in a folder that exists, is needed")
-    for name, least in (("episodes", 1), ("types", 1)):
-        if getattr(options, name) < least:
-            raise UsageError(f"--{name} {getattr(options, name)}: at least {least} is needed")
-    if not 0 <= options.seed < run.config.seeds:
-        raise UsageError(f"--seed {options.seed}: the run has seeds 0 to {run.config.seeds - 1}")
+    cli.check_out(out, ".mp4")
+    cli.at_least(1, episodes=options.episodes, types=options.types)
     view = full_name(run.config.scene, options.camera)
     logging.basicConfig(format="%(message)s")
     cache.keep_compiled()

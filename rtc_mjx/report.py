@@ -15,7 +15,7 @@ from rtc_mjx import charts, claims, cli, results, tables
 from rtc_mjx.errors import UsageError
 from rtc_mjx.files import write_whole
 from rtc_mjx.results import Record
-from rtc_mjx.runs import Run
+from rtc_mjx.runs import Run, by_method
 
 TABLES: Mapping[str, Callable[[Mapping[str, Record], str], str]] = {
     "table": tables.performance,
@@ -80,16 +80,9 @@ def of_runs(runs: Sequence[Run], out: Path) -> str:
     Raises:
         UsageError: they are of several scenes, or two of one method, or one has not been evaluated.
     """
-    scenes = {run.config.scene.name for run in runs}
-    if len(scenes) > 1:
-        raise UsageError(f"runs of one scene are needed, these are of {', '.join(sorted(scenes))}")
-    methods = [run.config.method for run in runs]
-    twice = [m for m in methods if methods.count(m) > 1]
-    if twice:
-        raise UsageError(f"one run a method is needed; there are {methods.count(twice[0])} of {twice[0]}")
-    records = [results.of_run(run) for run in runs]
+    records = {method: results.of_run(run) for method, run in by_method(runs).items()}
     out.mkdir(parents=True, exist_ok=True)
-    for method, record in zip(methods, records, strict=True):
+    for method, record in records.items():
         results.write(out, method, record)
     return rebuild(out)
 

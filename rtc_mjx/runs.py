@@ -13,7 +13,7 @@ import json
 import logging
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -203,6 +203,21 @@ class Run:
             except BlockingIOError:
                 raise UsageError(f"--run {self.folder}: another process is training there") from None
             yield
+
+
+def by_method(runs: Sequence[Run]) -> dict[str, Run]:
+    """Runs of one scene by their methods.
+
+    Raises:
+        UsageError: they are of several scenes, or two are of one method.
+    """
+    scenes = {run.config.scene.name for run in runs}
+    if len(scenes) > 1:
+        raise UsageError(f"runs of one scene are needed, these are of {', '.join(sorted(scenes))}")
+    methods = [run.config.method for run in runs]
+    if twice := [method for method in methods if methods.count(method) > 1]:
+        raise UsageError(f"one run a method is needed; there are {methods.count(twice[0])} of {twice[0]}")
+    return dict(zip(methods, runs, strict=True))
 
 
 def unbegun(folder: Path) -> bool:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from rtc_mjx import over_seeds, results
+from rtc_mjx import over_seeds, results, shift_report
 from rtc_mjx.methods import METHODS
 from rtc_mjx.over_seeds import number, signed
 from rtc_mjx.results import Record, markdown
@@ -90,11 +90,10 @@ def type_shift(held: Held, study: str) -> str:
     if not whole:
         return ""
     metric = scene_type(next(iter(whole.values()))["scene"]).main_metrics[0]
-    sources = ["paired", "same_xi", "shuffled", "prior"]
     shifts = ["conditional shift", "marginal shift", "told of xi, bit", "null", "told of mind, bit", "null"]
-    rows = [["method", *(f"{metric}, {source}" for source in sources), *shifts]]
+    rows = [["method", *(f"{metric}, {source}" for source in shift_report.SOURCES), *shifts]]
     for name, record in whole.items():
-        rows.append([name, *_shift_cells(record["type_shift"], metric, sources)])
+        rows.append([name, *_shift_cells(record["type_shift"], metric)])
     told = (
         "Types of the episode's own demonstration (paired), of another expert in the same episode (same_xi), of another episode "
         "(shuffled), of the prior. Conditional shift: shuffled less same_xi, or less paired where nobody else can drive the episode; "
@@ -103,10 +102,10 @@ def type_shift(held: Held, study: str) -> str:
     return markdown(rows, left=1) + f"\n{told}\n\n{made_by(whole, study)}"
 
 
-def _shift_cells(found: Mapping[str, Mapping], metric: str, sources: Sequence[str]) -> list[str]:
-    values = {source: np.array(found["types"][source][metric]) for source in sources if source in found["types"]}
+def _shift_cells(found: Mapping[str, Mapping], metric: str) -> list[str]:
+    values = {source: np.array(found["types"][source][metric]) for source in shift_report.SOURCES if source in found["types"]}
     base = values.get("same_xi", values["paired"])
-    cells = [number(values[source].tolist(), spread=True) if source in values else "" for source in sources]
+    cells = [number(values[source].tolist(), spread=True) if source in values else "" for source in shift_report.SOURCES]
     cells += [signed((values["shuffled"] - base).tolist()), signed((values["prior"] - values["shuffled"]).tolist())]
     for of in ("xi", "mind"):
         bits = found["information"].get(of)

@@ -120,22 +120,6 @@ def figure(result: dict[str, Any], file: Path) -> None:
     canvas.savefig(file, dpi=150)
 
 
-def checked(options: argparse.Namespace, episodes: int) -> int:
-    """The number of test episodes.
-
-    Raises:
-        UsageError: a number is too small.
-    """
-    for name, value, least in (
-        ("episodes", episodes, LEAST_TESTS),
-        ("experts", options.experts, 2),
-        ("probe", options.probe, LEAST_EPISODES),
-    ):
-        if value < least:
-            raise UsageError(f"--{name} {value}: at least {least} are needed")
-    return episodes
-
-
 def main(argv: Sequence[str] | None = None) -> None:
     """Analyses a run."""
     parser = cli.Parser(prog="python -m rtc_mjx.type_shift", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -145,7 +129,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--probe", type=int, default=4096, metavar="P", help="fresh demonstrations for the probes (default: 4096)")
     options = parser.parse_args(argv)
     run = Run.open(options.run)
-    episodes = checked(options, run.config.experts.test if options.episodes is None else options.episodes)
+    episodes = run.config.experts.test if options.episodes is None else options.episodes
+    cli.at_least(LEAST_TESTS, episodes=episodes)
+    cli.at_least(2, experts=options.experts)
+    cli.at_least(LEAST_EPISODES, probe=options.probe)
     cache.keep_compiled()
     result = analyse(run, episodes, options.experts, options.probe, evaluate.progress)
     console = cli.console()

@@ -115,7 +115,7 @@ def test_features_and_metrics_are_finite_and_the_expert_equals_itself(scene):
 def test_agents_are_compared_with_as_many_experts_as_they_have_rollouts(scene, tmp_path, monkeypatch):
     """They are made once, and those of the floor are others."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    theirs, floor = reference.experts(scene, 4), reference.more_experts(scene, 4)
+    theirs, floor = reference.both(scene, 4)
     assert all(x.shape[:2] == (scene.samples, 4) for held in (theirs, floor) for x in held.values())
     name = "return" if scene.samples == 1 else "ade"
     assert np.all(theirs[name] > 0) and not np.array_equal(theirs[name], floor[name])

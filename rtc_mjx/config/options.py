@@ -133,9 +133,10 @@ def flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def differing(ours: Config, theirs: Config) -> list[tuple[str, Any, Any]]:
-    """The settings in which two runs differ, of those that the method of the second reads, with the values of both."""
+    """The settings but for seeds in which two runs differ, of those that the method of the second reads, with the values of both."""
     one, other = (flat(to_dict(held)) for held in (ours, theirs))
-    return [(name, one[name], other.get(name)) for name in one if one[name] != other.get(name) and name not in unread(theirs.method)]
+    alike = {*SEEDS, *unread(theirs.method)}
+    return [(name, one[name], other.get(name)) for name in one if one[name] != other.get(name) and name not in alike]
 
 
 def unread(method: str) -> frozenset[str]:
