@@ -111,6 +111,7 @@ def join(runs: Sequence[Run], folder: Path) -> Run:
     states, wall_s = read(runs)
     seeds = range(first.config.first_seed, runs[-1].config.all_seeds.stop)
     whole = Run.create(part(first.config, seeds, folder))
+    whole.note_trained_by(*trainers(runs))
     for line in lines:
         whole.log(line)
     whole.save(whole.config.updates, joined_state(states), wall_s)
@@ -130,6 +131,16 @@ def check(runs: Sequence[Run]) -> None:
             raise UsageError(f"{run.folder} has {name} {ours}, {before.folder} has {theirs}: they are no blocks of one training")
     for run in runs:
         run.check_recordings()
+
+
+def trainers(runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """Code and packages that trained some runs; where they are not of one, that is said."""
+    made = [one for run in runs for one in run.trained_by()]
+    commits = list(dict.fromkeys(str(one["commit"]) for one in made))
+    if len(commits) > 1:
+        where = ", ".join(str(run.folder) for run in runs)
+        sys.stderr.write(f"seeds of different code are joined: {where} were trained at {', '.join(commits)}\n")
+    return made
 
 
 def joined_lines(files: Sequence[Sequence[Line]], names: Sequence[str]) -> list[dict[str, Any]]:

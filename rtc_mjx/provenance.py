@@ -28,9 +28,14 @@ NUMERIC = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")  # that numbers dep
 
 
 def made_by() -> dict[str, Any]:
-    """`versions` of the packages, `commit` of the checkout that this code runs from (None where there is none), and `measured_by`."""
+    """What `code` says, and `measured_by`."""
+    return code() | {"measured_by": measured_by()}
+
+
+def code() -> dict[str, Any]:
+    """`versions` of the packages, and `commit` of the checkout that this code runs from (None where there is none)."""
     versions = {"python_package": __version__, **{name: metadata.version(name) for name in PACKAGES}}
-    return {"versions": versions, "commit": _commit(), "measured_by": measured_by()}
+    return {"versions": versions, "commit": _commit()}
 
 
 def measured_by() -> str:

@@ -56,6 +56,7 @@ def of_run(run: Run, study: str = "") -> dict[str, Any]:
         **evaluation(run),
         **({"type_shift": shift} if shift else {}),
         **({"study": study} if study else {}),
+        "trained_by": run.trained_by(),
         "config": table,
         "options": options(table),
         "curves": curves(run),

@@ -1,4 +1,6 @@
-"""A run directory: config.json, metrics.jsonl, TensorBoard files, checkpoints/, media/, evaluation.json. It describes itself.
+"""A run directory, which describes itself.
+
+It holds config.json, trained_by.json, metrics.jsonl, TensorBoard files, checkpoints/, media/ and evaluation.json.
 
 A run that was joined from others (`rtc_mjx.blocks`) has these in blocks/, with their TensorBoard files.
 
@@ -13,7 +15,7 @@ import json
 import logging
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,7 @@ from rtc_mjx.files import write_whole
 
 KEPT = 3  # checkpoints
 RECORDINGS = "recordings.json"  # which the run learns from and is tested on, where its scene has any
+TRAINED_BY = "trained_by.json"  # code and packages that trained it, in order
 PARTS = ("checkpoints", "media")
 
 
@@ -88,6 +91,26 @@ class Run:
             changed = sorted(set(before) ^ set(there))
             told = f"{len(changed)} went or came, first '{changed[0]}'" if changed else "they come in another order"
             raise UsageError(f"{self.folder}: its recordings are not the {len(before)} it began with ({RECORDINGS}); {told}")
+
+    def trained_by(self) -> list[dict[str, Any]]:
+        """Code and packages that trained it, as in `provenance.code`, first to last; empty of a run of a version that did not write them.
+
+        Raises:
+            UsageError: the file is damaged.
+        """
+        file = self.folder / TRAINED_BY
+        if not file.is_file():
+            return []
+        try:
+            return [dict(made) for made in json.loads(file.read_text())]
+        except (ValueError, TypeError) as error:
+            raise UsageError(f"{file} is damaged: {error}") from error
+
+    def note_trained_by(self, *made: Mapping[str, Any]) -> None:
+        """Adds code and packages to those that trained it, but for those that are there."""
+        held = self.trained_by()
+        held += [dict(one) for i, one in enumerate(made) if one not in held and one not in made[:i]]
+        write_whole(self.folder / TRAINED_BY, json.dumps(held, indent=1) + "\n")
 
     @property
     def metrics_file(self) -> Path:
@@ -235,6 +258,9 @@ class Follower(Run):
         """Nothing."""
 
     def save(self, update: int, state: Any, wall_s: float) -> None:
+        """Nothing."""
+
+    def note_trained_by(self, *made: Mapping[str, Any]) -> None:
         """Nothing."""
 
     @contextlib.contextmanager

@@ -211,6 +211,8 @@ def made_by(shown: Held, folder: str) -> str:
         told += " What follows the number of seeds differs from the committed settings."
     commits = {of: [name for name in shown if _commit(shown[name]) == of] for of in dict.fromkeys(map(_commit, shown.values()))}
     told += " Commit " + "; ".join(f"{of} ({', '.join(names)})" if len(commits) > 1 else of for of, names in commits.items()) + "."
+    if trained := {name: by for name, record in shown.items() if (by := _trained_at(record))}:
+        told += " Trained at " + "; ".join(f"{', '.join(by)} ({name})" for name, by in trained.items()) + "."
     if len({record.get("measured_by") for record in shown.values()}) > 1:
         told += " **Rows were measured by different code**: the study measures again those that it finds finished."
     place = f"results/{folder}" if all("study" in record for record in shown.values()) else "DIR"
@@ -239,3 +241,9 @@ def own_options(name: str, record: Record) -> tuple[str, ...]:
 
 def _commit(record: Record) -> str:
     return str(record["commit"] or "unknown")
+
+
+def _trained_at(record: Record) -> list[str]:
+    """The commits that trained a result, where they are not the one that measured it."""
+    commits = list(dict.fromkeys(str(made["commit"] or "unknown") for made in record.get("trained_by", [])))
+    return [] if commits == [_commit(record)] else commits

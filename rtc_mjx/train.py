@@ -83,6 +83,8 @@ def learn(run: Run, config: Config, grid: Grid, team: Team) -> None:
     expert = dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN)
     learner = config.learner(dataset.statistics(config.scene, expert))
     state, update, before = begin_together(run, learner, config, team)
+    if update < config.updates:
+        run.note_trained_by(provenance.code())
     grid.connect()
     state, data = grid.by_seed(state), grid.everywhere(dataset.without_truth(expert))
     test, chunks = Tests(config, learner, grid), functools.cache(lambda length: compiled_chunk(learner, length, grid))

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from test_study import SMALL, command
 
-from rtc_mjx import blocks, config, entry, evaluate, study, train, type_shift
+from rtc_mjx import blocks, config, entry, evaluate, provenance, study, train, type_shift
 from rtc_mjx.errors import UsageError
-from rtc_mjx.runs import Run
+from rtc_mjx.runs import TRAINED_BY, Run
 from rtc_mjx.trained import restored
 
 
@@ -224,6 +224,23 @@ def test_what_is_not_blocks_of_one_training_is_not_joined(again, some, tmp_path)
     with pytest.raises(UsageError, match="no whole checkpoint of update 4"):
         blocks.join([run], tmp_path / "joined")
     assert not (tmp_path / "joined").exists()
+
+
+def test_a_run_says_which_code_trained_it_and_a_joined_one_all_that_did(again, extended, tmp_path, capsys):
+    now = provenance.code()
+    run, later = Run.open(bc(again)), Run.open(bc(extended) / "blocks" / "seeds_2_2")
+    assert run.trained_by() == later.trained_by() == Run.open(bc(extended)).trained_by() == [now]
+    train.train(dataclasses.replace(run.config, resume=True))  # there is nothing left to train
+    old = now | {"commit": "0ldc0de"}
+    (run.folder / TRAINED_BY).write_text(json.dumps([old]))
+    assert blocks.join([run, later], tmp_path / "joined").trained_by() == [old, now]
+    assert f"were trained at 0ldc0de, {now['commit']}" in capsys.readouterr().err
+    shutil.rmtree(run.folder / "checkpoints" / "4")
+    train.train(dataclasses.replace(run.config, resume=True))
+    assert run.trained_by() == [old, now]
+    (run.folder / TRAINED_BY).write_text("[1]")
+    with pytest.raises(UsageError, match="trained_by.json is damaged"):
+        run.trained_by()
 
 
 def test_lines_of_all_seeds_hold_what_all_blocks_logged(capsys):

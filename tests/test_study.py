@@ -205,7 +205,10 @@ def test_tables_name_what_differs_from_the_committed_settings_and_other_commits(
     text = report.TABLES["table"](held, "few")
     assert "`python -m rtc_mjx.study --scene double_goal --methods mgail --seeds 4 --name few --results results`" in text
     assert "--methods rtc_c --seeds 4 --name few --first-seed 1 --results results" in text
-    assert "abc (mgail); def (rtc_c)" in text and "measured by different code" in text
+    assert "abc (mgail); def (rtc_c)" in text and "measured by different code" in text and "Trained at" not in text
+    held["rtc_c"]["trained_by"] = [{"commit": "old"}, {"commit": "old"}, {"commit": None}]
+    held["mgail"]["trained_by"] = [{"commit": "abc"}]  # the code that measured it
+    assert "Trained at old, unknown (rtc_c)." in report.TABLES["table"](held, "few")
     del held["rtc_c"]["study"]  # of a run that `train` made
     assert "`python -m rtc_mjx.train --scene double_goal --method rtc_c --seeds 4 --first-seed 1`" in report.TABLES["table"](held, "few")
 
