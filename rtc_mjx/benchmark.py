@@ -328,9 +328,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parts = _chosen("part", options.parts or ",".join(PARTS[: 2 if options.quick else 3]), PARTS)
     names = _chosen("world", options.worlds, WORLDS)
     batches = [64] if options.quick else _batches(options.batches)
-    for path in (options.json, options.figure):
-        if path is not None and not path.absolute().parent.is_dir():
-            raise UsageError(f"{path}: there is no folder {path.absolute().parent}")
+    cli.check_outs(json=options.json, figure=options.figure)
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are measured
     if options.scaling_on:
         sys.stdout.write(json.dumps(scaling.measure_here(options.scene, options.scaling_on, options.rounds)) + "\n")

@@ -135,11 +135,11 @@ def check(runs: Sequence[Run]) -> None:
 
 def trainers(runs: Sequence[Run]) -> list[dict[str, Any]]:
     """Code and packages that trained some runs; where they are not of one, that is said."""
-    made = [one for run in runs for one in run.trained_by()]
+    made = [one for run in runs for one in run.trained_by() or [{"commit": None}]]
     commits = list(dict.fromkeys(str(one["commit"]) for one in made))
     if len(commits) > 1:
         where = ", ".join(str(run.folder) for run in runs)
-        sys.stderr.write(f"seeds of different code are joined: {where} were trained at {', '.join(commits)}\n")
+        sys.stderr.write(f"seeds of different code are joined: {where} were trained at {', '.join(commits)} (None: not known)\n")
     return made
 
 

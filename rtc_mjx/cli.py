@@ -32,14 +32,36 @@ def at_least(least: int, **options: int) -> None:
             raise UsageError(f"--{name} {value}: at least {least} {'is' if least == 1 else 'are'} needed")
 
 
-def check_out(file: Path, ending: str) -> None:
-    """Checks `--out`: a file that is to be written.
+def refuse(words: Sequence[str], prog: str, **instead: str) -> None:
+    """Refuses options of a training that a command sets itself; `instead`: by name, without dashes, what to do.
+
+    Raises:
+        UsageError: one of them is among the words.
+    """
+    for word in words:
+        if told := instead.get(word.partition("=")[0].removeprefix("--")):
+            raise UsageError(f"{prog}: {word.partition('=')[0]} is not an option here; {told} (see --help)")
+
+
+def check_out(file: Path, ending: str, option: str = "--out") -> None:
+    """Checks a file that is to be written.
 
     Raises:
         UsageError: its name ends otherwise, or its folder does not exist.
     """
     if file.suffix != ending or not file.absolute().parent.is_dir():
-        raise UsageError(f"--out {file}: a file name that ends in {ending}, in a folder that exists, is needed")
+        raise UsageError(f"{option} {file}: a file name that ends in {ending}, in a folder that exists, is needed")
+
+
+def check_outs(json: Path | None, figure: Path | None) -> None:
+    """Checks `--json` and `--figure`, where they are given.
+
+    Raises:
+        UsageError: as `check_out`.
+    """
+    for option, file, ending in (("--json", json, ".json"), ("--figure", figure, ".png")):
+        if file is not None:
+            check_out(file, ending, option)
 
 
 def console() -> Console:

@@ -2,7 +2,8 @@
 
 Three rollouts of the same test episodes (method notes, section 7): types from each episode's own demonstration (paired), from
 another episode's (shuffled), from the prior. Paired to shuffled is conditional shift, shuffled to prior is marginal shift. The
-expert, and expert against expert, stand beside them: the ceiling, and the floor of every divergence (`rtc_mjx.reference`).
+expert, and expert against expert, stand beside them: the ceiling, and the floor of every divergence (`rtc_mjx.reference`); so does the
+replay of the logs, where experts are others than those of the logs.
 """
 
 import argparse
@@ -152,7 +153,7 @@ def evaluate(run: Run, episodes: int, watch: Watch = iter) -> dict[str, Any]:
     roll, shown = roller(learner, config.scene.samples, watch), dataset.without_truth(test)
     given = donors(learner.scene, learner.method, shown)
     features = roll(networks, shown, given, stream("evaluation", 0))
-    expert, second = reference.both(config.scene, episodes)
+    expert = reference.experts(config.scene, episodes)
     table = score(config, features, expert)
     means = {source: _summaries(config, features[source], expert, table[source]) for source in table}
     scene = config.scene
@@ -174,9 +175,21 @@ def evaluate(run: Run, episodes: int, watch: Watch = iter) -> dict[str, Any]:
             "reaction": reaction(learner, functools.partial(roll, networks), shown, features),
             "ranges": {name: list(limits) for name, limits in config.scene.ranges(expert).items()},
             "notes": {what: count for what, count in config.scene.notes(test.episode).items() if count},
-            "reference": {"expert": config.scene.metrics(expert, expert), "expert_vs_expert": config.scene.metrics(second, expert)},
+            "reference": references(config.scene, episodes),
         }
     )
+
+
+def references(scene: Scene, episodes: int) -> dict[str, dict[str, float]]:
+    """Metrics of the experts that agents are compared with, of as many others, and of the logs themselves where these are not the first.
+
+    A log is as near to itself as can be (minADE 0), but there is one of each episode: its divergences have a bias that those of agents,
+    who drive each episode several times, do not.
+    """
+    expert, second = reference.both(scene, episodes)
+    log = reference.log_replay(scene, episodes)
+    held = {"expert": expert, "expert_vs_expert": second} | ({} if log is None else {"log_replay": log})
+    return {who: scene.metrics(features, expert) for who, features in held.items()}
 
 
 def reaction(learner: Learner, roll: RollTrained, shown: Demonstration, features: dict[str, Features]) -> dict[str, dict[str, float]]:

@@ -31,6 +31,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--scene", required=True, metavar="NAME", help="the scene")
     parser.add_argument("--episodes", type=int, default=512, metavar="N", help="test episodes (default %(default)s)")
     options, rest = parser.parse_known_args(argv)
+    cli.refuse(rest, COMMAND, method="experts have none", run="there is no run", resume="there is no run")
     cli.at_least(4, episodes=options.episodes)
     asked = ["--scene", options.scene, "--method", "bc", *rest, "--experts.test", str(options.episodes)]
     settings = config.from_command_line(asked, COMMAND)

@@ -36,11 +36,11 @@ def experts(scene: Scene, shown: Demonstration, count: int) -> Trajectory:
     return jax.tree.map(lambda x: np.asarray(x)[:, None], shown.trajectory)
 
 
-def of_runs(runs: Sequence[Run], episodes: int, agents: int, seed_index: int = 0) -> tuple[Scene, Demonstration, dict[str, Trajectory]]:
+def of_runs(runs: Sequence[Run], episodes: int, agents: int, seed: int | None = None) -> tuple[Scene, Demonstration, dict[str, Trajectory]]:
     """The scene, the test demonstrations, and by name what each population does in them, experts first: (episodes, agents, ...).
 
     Raises:
-        UsageError: the runs are of different scenes, two are of one method, or one has fewer seeds.
+        UsageError: the runs are of different scenes, two are of one method, or one has no such seed.
     """
     named, scene = by_method(runs), runs[0].config.scene
     for run in runs:
@@ -48,7 +48,7 @@ def of_runs(runs: Sequence[Run], episodes: int, agents: int, seed_index: int = 0
             raise UsageError(f"{run.folder}: its scene has other settings than that of {runs[0].folder}")
     held = {}
     for name, run in named.items():
-        shown, held[name] = rollouts(run, episodes, agents, seed_index)
+        shown, held[name] = rollouts(run, episodes, agents, seed)
     return scene, shown, {"expert": experts(scene, shown, agents), **held}
 
 
@@ -87,7 +87,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.png", help="the picture")
     parser.add_argument("--episodes", type=int, default=2, help="test episodes, a row each (default %(default)s)")
     parser.add_argument("--agents", type=int, default=24, help="lines in each cell (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, metavar="I", help="which of a run's seeds acts (default %(default)s)")
+    parser.add_argument("--seed", type=int, metavar="N", help="which of a run's seeds acts (default: the first of each)")
     options = parser.parse_args(argv)
     cli.check_out(options.out, ".png")
     cli.at_least(1, episodes=options.episodes, agents=options.agents)

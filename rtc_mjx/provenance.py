@@ -15,6 +15,7 @@ PACKAGES = ("mujoco", "mujoco-mjx", "jax", "flax", "optax")  # that a result nam
 MEASURING = (
     "evaluate.py",
     "metrics.py",
+    "geometry.py",
     "reference.py",
     "recorded_realism.py",
     "type_shift.py",

@@ -37,6 +37,11 @@ def both(scene: Scene, count: int) -> tuple[Features, Features]:
     return {name: x[: scene.samples] for name, x in held.items()}, {name: x[scene.samples :] for name, x in held.items()}
 
 
+def log_replay(scene: Scene, count: int) -> Features | None:
+    """Features of the test demonstrations themselves, one an episode; None where they are what agents are compared with (`experts`)."""
+    return _alone(scene, count, dataset.TEST) if _driven_again(scene) else None
+
+
 def _driven_again(scene: Scene) -> bool:
     return scene.redrivable and scene.samples > 1
 

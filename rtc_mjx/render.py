@@ -38,14 +38,25 @@ AWAY = -50.0  # m, below the ground: where marks wait for their time
 HOLD = 10  # frames for which the end of an episode stays
 
 
-def rollouts(run: Run, episodes: int, types: int, seed_index: int) -> tuple[Demonstration, Trajectory]:
+def rollouts(run: Run, episodes: int, types: int, seed: int | None = None) -> tuple[Demonstration, Trajectory]:
     """Test demonstrations, and rollouts of the run's last checkpoint in each under `types` draws of its test types.
 
+    Args:
+        run: trained.
+        episodes: how many.
+        types: rollouts of each.
+        seed: which of the run's seeds acts, by its own number; None for the first.
+
+    Returns:
+        The demonstrations, with a leading axis of episodes, and the rollouts, with leading axes (episodes, types).
+
     Raises:
-        UsageError: the run has fewer seeds.
+        UsageError: the run has no such seed.
     """
-    if not 0 <= seed_index < run.config.seeds:
-        raise UsageError(f"--seed {seed_index}: {run.folder} has seeds 0 to {run.config.seeds - 1}")
+    seeds = run.config.all_seeds
+    if seed is not None and seed not in seeds:
+        raise UsageError(f"--seed {seed}: {run.folder} has seeds {seeds[0]} to {seeds[-1]}")
+    seed_index = 0 if seed is None else seeds.index(seed)
     held = trained(run)
     config, learner = held.config, held.learner
     test = dataset.demonstrations(config.scene, config.experts.test, dataset.TEST)
@@ -189,7 +200,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--camera", default="top", metavar="NAME", help="a camera of the scene's MJCF file (default %(default)s)")
     parser.add_argument("--episodes", type=int, default=4, help="test episodes, one after another (default %(default)s)")
     parser.add_argument("--types", type=int, default=5, help="rollouts in each, every one with a type of its own (default %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, metavar="I", help="which of the run's seeds acts (default %(default)s)")
+    parser.add_argument("--seed", type=int, metavar="N", help="which of the run's seeds acts (default: its first)")
     parser.add_argument("--size", default="480x480", metavar="WxH", help="picture size, even numbers (default %(default)s)")
     options = parser.parse_args(argv)
     run = Run.open(options.run)
@@ -224,7 +235,7 @@ def full_name(scene: Scene, wanted: str) -> str:
 def _size(text: str) -> tuple[int, int]:
     """(height, width) of 'WxH'."""
     parts = text.split("x")
-    if len(parts) != 2 or not all(p.isdigit() and int(p) >= 16 and int(p) % 2 == 0 for p in parts):
+    if len(parts) != 2 or not all(p.isdecimal() and int(p) >= 16 and int(p) % 2 == 0 for p in parts):
         raise UsageError(f"--size {text}: width x height in even numbers from 16 is needed, such as 480x480")
     return int(parts[1]), int(parts[0])
 

@@ -17,6 +17,7 @@ from rtc_mjx.files import write_whole
 from rtc_mjx.results import Record
 from rtc_mjx.runs import Run, by_method
 
+CLAIMS = "claims.md"
 TABLES: Mapping[str, Callable[[Mapping[str, Record], str], str]] = {
     "table": tables.performance,
     "comparisons": tables.comparisons,
@@ -71,7 +72,24 @@ def draw(whole: Mapping[str, Record], folder: Path) -> None:
 def rebuild_claims(folder: Path) -> None:
     """Writes claims.md of all results in folders beside each other."""
     if text := claims.everywhere(folder):
-        write_whole(folder / "claims.md", text + f"\nMade by `python -m rtc_mjx.report {folder.resolve().name}` from results/*/*.json.\n")
+        write_whole(folder / CLAIMS, text + f"\nMade by `python -m rtc_mjx.report {folder.resolve().name}` from results/*/*.json.\n")
+
+
+def made(folder: Path) -> None:
+    """Makes a folder for results, where it is not there.
+
+    Raises:
+        UsageError: it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{folder}: {error.strerror}; a folder for results is needed") from error
+
+
+def studies(folder: Path) -> list[Path]:
+    """The folders of results in a folder."""
+    return [place for place in sorted(folder.iterdir()) if place.is_dir() and results.read(place)]
 
 
 def of_runs(runs: Sequence[Run], out: Path) -> str:
@@ -81,7 +99,10 @@ def of_runs(runs: Sequence[Run], out: Path) -> str:
         UsageError: they are of several scenes, or two of one method, or one has not been evaluated.
     """
     records = {method: results.of_run(run) for method, run in by_method(runs).items()}
-    out.mkdir(parents=True, exist_ok=True)
+    made(out)
+    if holds := studies(out):
+        names = ", ".join(place.name for place in holds)
+        raise UsageError(f"--out {out} holds studies ({names}); name a folder of its own, such as {out / 'mine'}")
     for method, record in records.items():
         results.write(out, method, record)
     return rebuild(out)
@@ -91,9 +112,10 @@ def of_results(folder: Path) -> str:
     """Makes tables and figures again of results/<name>, or of all that is in results."""
     if results.read(folder):
         text = rebuild(folder)
-        rebuild_claims(folder.resolve().parent)
+        if (folder.resolve().parent / CLAIMS).is_file():
+            rebuild_claims(folder.resolve().parent)
         return text
-    places = [place for place in sorted(folder.iterdir()) if place.is_dir() and results.read(place)]
+    places = studies(folder)
     if not places:
         raise UsageError(f"{folder} is not a run directory, and holds no results")
     text = "\n".join(f"# {place.name}\n\n{rebuild(place)}" for place in places)

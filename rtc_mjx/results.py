@@ -151,6 +151,11 @@ def metric(record: Record, source: str, name: str) -> Seeds:
     return seeds(record, record["types"][source][name]["per_seed"])
 
 
+def comparable(one: Record, other: Record) -> bool:
+    """Whether two results were measured in the same test episodes: of recordings, a method may leave some out."""
+    return bool(one.get("recordings") == other.get("recordings"))
+
+
 def markdown(rows: Sequence[Sequence[str]], left: int) -> str:
     """A Markdown table of rows, the first of which is its head; `left`: how many columns are words, those after them are numbers."""
     head, *others = rows

@@ -121,12 +121,12 @@ class Run:
         """All complete lines of metrics.jsonl."""
         if not self.metrics_file.is_file():
             return []
-        lines = self.metrics_file.read_text().split("\n")[:-1]  # after the last newline: nothing, or a line cut short
+        lines = self.metrics_file.read_bytes().split(b"\n")[:-1]  # after the last newline: nothing, or a line cut short
         held = []
         for number, line in enumerate(lines, 1):
             try:
                 held.append(json.loads(line))
-                held[-1]["update"]
+                held[-1]["update"] + 0
             except (ValueError, KeyError, TypeError) as error:
                 raise UsageError(f"{self.metrics_file}, line {number} is damaged: {error}") from error
         return held

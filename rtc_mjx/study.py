@@ -140,13 +140,16 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--name", metavar="NAME", help="of the study, where a scene has several (default: the scene's)")
     parser.add_argument("--runs", type=Path, metavar="DIR", help="where the runs are kept (default: runs/study)")
     options, rest = parser.parse_known_args(argv)
+    cli.refuse(
+        rest, COMMAND, method="name methods with --methods A,B", run="--runs DIR is where runs are kept", resume="a study goes on by itself"
+    )
     scene_type(options.scene)
     chosen = [method_name(name) for name in options.methods.split(",")] if options.methods else on_scene(options.scene, rest)
     if options.ablations:  # what variations are compared with
         chosen += [method for method in dict.fromkeys(method for method, _ in VARIATIONS.values()) if method not in chosen]
     cache.keep_compiled()
     name = options.name or options.scene
-    if Path(name).name != name:
+    if Path(name).name != name or name == "..":
         raise UsageError(f"--name {name}: a name is needed, not a path")
     folder, out = (options.runs or Path("runs/study")) / name, options.results / name
     wanted = entries(options.scene, chosen, options.ablations, ["--seeds", str(options.seeds), *rest])
@@ -165,7 +168,7 @@ def conduct(scene: str, wanted: Sequence[Entry], folder: Path, out: Path, team: 
     failed: dict[str, RunError] = {}
     text = ""
     if team.leads:
-        out.mkdir(parents=True, exist_ok=True)
+        report.made(out)
         if there := collected(wanted, scene, folder):  # before hours of training: what is known now is shown now
             text = write(there, folder, out, pending=True)
     for number, entry in enumerate(wanted, 1):

@@ -53,8 +53,8 @@ def comparisons(held: Held, study: str) -> str:
     whole = results.methods(results.finished(held))
     tests: list[tuple[str, str, str, np.ndarray]] = []
     for name in whole:
-        for against in [other for other in _references(name) if other in whole]:
-            for metric in whole[name]["metrics"]:
+        for against in [other for other in _references(name) if other in whole and results.comparable(whole[name], whole[other])]:
+            for metric in [metric for metric in whole[name]["metrics"] if metric in whole[against]["metrics"]]:
                 ours, theirs = (results.metric(whole[n], "prior", metric) for n in (name, against))
                 tests.append((name, against, metric, over_seeds.paired(ours, theirs)))
     tests = [test for test in tests if len(test[3]) > 1]

@@ -159,6 +159,9 @@ def row(claim: Claim, held: Held) -> list[str]:
     if absent := sorted((claim.left.names | claim.right.names) - set(whole)):
         failed = [f"{name} {held[name]['failed'].partition(':')[0]}" if name in held else f"{name} was not run" for name in absent]
         return [*first, "; ".join(failed), "", "not tested", ""]
+    first_of, *others = [whole[name] for name in sorted(claim.left.names | claim.right.names)]
+    if not all(results.comparable(first_of, other) for other in others):
+        return [*first, "tested on other recordings", "", "not tested", ""]
     try:
         margin = claim.margin(whole)
     except KeyError as error:

@@ -235,6 +235,9 @@ def test_a_run_says_which_code_trained_it_and_a_joined_one_all_that_did(again, e
     (run.folder / TRAINED_BY).write_text(json.dumps([old]))
     assert blocks.join([run, later], tmp_path / "joined").trained_by() == [old, now]
     assert f"were trained at 0ldc0de, {now['commit']}" in capsys.readouterr().err
+    (run.folder / TRAINED_BY).unlink()  # of a version that did not write it
+    assert blocks.trainers([run, later]) == [{"commit": None}, now] and "trained at None, " in capsys.readouterr().err
+    (run.folder / TRAINED_BY).write_text(json.dumps([old]))
     shutil.rmtree(run.folder / "checkpoints" / "4")
     train.train(dataclasses.replace(run.config, resume=True))
     assert run.trained_by() == [old, now]

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from rtc_mjx import benchmark, config
+from rtc_mjx import benchmark, config, experts, study
+from rtc_mjx.config import command_line
 from rtc_mjx.errors import UsageError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -68,7 +69,8 @@ def test_hand_written_equations_do_what_the_world_does(name):
         (["--batches", "16,x"], "--batches 16,x"),
         (["--batches", "0"], "--batches 0"),
         (["--rounds", "0"], "--rounds 0"),
-        (["--json", "/nowhere/at/all.json"], "/nowhere/at"),
+        (["--json", "/nowhere/at/all.json"], "--json /nowhere/at"),
+        (["--figure", "speed.foo"], "--figure speed.foo: a file name that ends in .png"),
     ],
 )
 def test_wrong_options_are_refused_in_one_line(options, named):
@@ -84,9 +86,30 @@ def test_wrong_use_leaves_with_status_2_and_one_line():
         assert options[-1] in done.stderr
 
 
-def test_what_experts_do_is_told_with_intervals(capsys):
-    from rtc_mjx import experts
+def test_a_message_in_colours_is_one_plain_line():
+    red, plain = "\x1b[31m", "\x1b[0m"
+    lines = ["╭─ Unrecognized options ─╮", "│ Unrecognized options: --sceen │", "│ ───── │", "│ --seeds INT │"]
+    boxed = "\n".join(f"{red}{line}{plain}" for line in lines).replace("--", f"{red}--{plain}")
+    told = command_line._one_line(boxed, "train")
+    assert told == "train: Unrecognized options: --sceen; near it: --seeds (see --help)"
 
+
+@pytest.mark.parametrize(
+    ("command", "options", "named"),
+    [
+        (study, ["--results", "out", "--method", "rtc"], "--method is not an option here; name methods with --methods"),
+        (study, ["--results", "out", "--run=runs/x"], "--run is not an option here; --runs DIR"),
+        (study, ["--results", "out", "--name", ".."], "--name ..: a name is needed"),
+        (experts, ["--method", "rtc"], "--method is not an option here"),
+    ],
+)
+def test_options_of_one_training_are_no_options_of_a_study(command, options, named):
+    """They would be taken for those of every entry: all methods would be one."""
+    with pytest.raises(UsageError, match=named):
+        command.main(["--scene", "double_goal", *options])
+
+
+def test_what_experts_do_is_told_with_intervals(capsys):
     experts.main(["--scene", "double_goal", "--episodes", "64", "--scene.steps", "20"])
     table = dict(line.split("│")[1:3] for line in capsys.readouterr().out.splitlines() if line.startswith("│"))
     assert {name.strip() for name in table} == {"return", "jsd_goal", "jsd_goal_and_turn", "lower"}

@@ -155,12 +155,12 @@ def test_metrics_cut_short_by_a_crash_lose_only_the_last_line(whole, tmp_path):
     with run.metrics_file.open("a") as file:
         file.write('{"update": 50, "wall')
     assert lines(run) == lines(whole)
-    for damage in ('{"updat": 1}', "[]", "{"):
-        held = run.metrics_file.read_text()
-        run.metrics_file.write_text(f"{damage}\n{held}")
+    for damage in (b'{"updat": 1}', b'{"update": "x"}', b"[]", b"{", b"\xff\xfe"):
+        held = run.metrics_file.read_bytes()
+        run.metrics_file.write_bytes(damage + b"\n" + held)
         with pytest.raises(UsageError, match="line 1 is damaged"):
             run.metrics()
-        run.metrics_file.write_text(held)
+        run.metrics_file.write_bytes(held)
     run.rewind(20)
     assert [line["update"] for line in run.metrics()] == [10, 20]
 
@@ -271,6 +271,13 @@ def test_populations_are_drawn_beside_experts_in_the_same_part_of_the_world(whol
     scene, shown, held = populations.of_runs([whole], 2, 3)
     assert list(held) == ["expert", "rtc_c"]
     assert {np.asarray(track.states.qpos).shape for track in held.values()} == {(2, 3, SCENE.steps + 1, 2)}
+    _, of_second = render.rollouts(whole, 2, 3, seed=1)
+    np.testing.assert_array_equal(render.rollouts(whole, 2, 3)[1].states.qpos, held["rtc_c"].states.qpos)
+    assert not np.array_equal(of_second.states.qpos, held["rtc_c"].states.qpos)
+    later = Run(whole.folder, dataclasses.replace(whole.config, first_seed=3))  # the seeds' own numbers, not their places
+    for seed in (0, 5):
+        with pytest.raises(UsageError, match=f"--seed {seed}: .* has seeds 3 to 4"):
+            render.rollouts(later, 2, 3, seed=seed)
     left, right, *_ = populations.draw(scene, shown, held).axes
     assert left.get_xlim() == right.get_xlim() and left.get_ylim() == right.get_ylim()
 

@@ -14,7 +14,7 @@ from dm_env import test_utils
 from jax import random
 from made import demonstrated, made
 
-from rtc_mjx import cache, dataset, reference
+from rtc_mjx import cache, dataset, evaluate, reference
 from rtc_mjx.environment import Environment
 from rtc_mjx.errors import NonFiniteError, UsageError
 from rtc_mjx.rollout import rollout
@@ -122,6 +122,9 @@ def test_agents_are_compared_with_as_many_experts_as_they_have_rollouts(scene, t
     monkeypatch.setattr(cache, "write_arrays", None)  # would be called if they were made again
     again = reference.experts(scene, 4)
     assert all(np.array_equal(x, again[name]) for name, x in theirs.items())
+    log = evaluate.references(scene, 4).get("log_replay")
+    assert (log is None) == (scene.samples == 1)  # there the demonstrations themselves are what agents are compared with
+    assert log is None or (log["min_ade"] == 0 and log["progress_jsd"] > 0 and np.isfinite(list(log.values())).all())
 
 
 def test_what_is_seen_at_the_start_has_a_finite_derivative(scene):

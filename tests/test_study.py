@@ -213,6 +213,36 @@ def test_tables_name_what_differs_from_the_committed_settings_and_other_commits(
     assert "`python -m rtc_mjx.train --scene double_goal --method rtc_c --seeds 4 --first-seed 1`" in report.TABLES["table"](held, "few")
 
 
+def test_methods_tested_on_other_recordings_are_not_compared():
+    held = {name: record(name, prior={"collision_rate": [0.1] * 4}) | {"scene": "womd"} for name in ("mgail", "rtc_c", "symphony")}
+    for name in held:
+        held[name] |= {"recordings": {"digest": "few" if name == "symphony" else "all"}}
+    held["symphony"]["metrics"] = held["symphony"]["metrics"] | {"curvature_jsd": held["symphony"]["metrics"]["collision_rate"]}
+    lines = report.TABLES["comparisons"](held, "few").splitlines()
+    assert any(line.startswith("| rtc_c | mgail") for line in lines) and not any("symphony" in line for line in lines if line[:1] == "|")
+    rows = [line for line in report.TABLES["claims"](held, "few").splitlines() if "at most as often as Symphony (continuous" in line]
+    assert len(rows) == 1 and "tested on other recordings" in rows[0] and "not tested" in rows[0]
+
+
+def test_runs_are_not_reported_among_studies_nor_claims_beside_a_lone_one(tmp_path, monkeypatch):
+    values = {"return": [1.0] * 4, "jsd_goal": [0.1] * 4}
+    held = record("mgail", reference={"expert": {name: x[0] for name, x in values.items()}}, prior=values) | {"curves": {}}
+    (tmp_path / "few").mkdir()
+    results.write(tmp_path / "few", "mgail", held)
+    report.main([str(tmp_path / "few")])
+    assert not (tmp_path / "claims.md").exists()
+    report.main([str(tmp_path)])
+    before = (tmp_path / "claims.md").read_text()
+    (tmp_path / "claims.md").write_text("old")
+    report.main([str(tmp_path / "few")])
+    assert (tmp_path / "claims.md").read_text() == before
+    monkeypatch.setattr(results, "of_run", lambda run: held)
+    with pytest.raises(UsageError, match="holds studies .few.; name a folder of its own"):
+        report.of_runs([SimpleNamespace(config=SimpleNamespace(scene=SimpleNamespace(name="double_goal"), method="mgail"))], tmp_path)
+    with pytest.raises(UsageError, match="claims.md: .*a folder for results is needed"):
+        report.made(tmp_path / "claims.md")
+
+
 def test_options_of_a_result_give_its_settings_again():
     argv = ["--scene", "double_goal", "--method", "rtc_d", "--losses.type-kl", "0.003", "--no-choice"]
     argv = [*argv[:-1], "--model.no-choice-gradient", "--scene.steps", "20", "--first-seed", "3", "--seeds", "2"]

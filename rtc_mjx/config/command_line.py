@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import dataclasses
 import io
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -83,11 +84,13 @@ def _parse(config: Config, argv: list[str], prog: str) -> Config:
         raise UsageError(_one_line(told.getvalue(), prog)) from None
 
 
+COLOUR = re.compile(r"\x1b\[[0-9;]*m")  # of terminals
 DESCRIPTION = """Trains a method on a scene. `--scene NAME` and `--method NAME` choose; all else has a default (configs/<scene>.toml)."""
 
 
 def _one_line(boxed: str, prog: str) -> str:
     """The first message of tyro's box, with the option it suggests."""
+    boxed = COLOUR.sub("", boxed)
     lines = [line.strip("│╭╮╰╯ ").strip() for line in boxed.splitlines()[1:]]
     rule = next((i for i, line in enumerate(lines) if set(line) <= {"─"}), len(lines))
     message = " ".join(lines[:rule]) or boxed.strip()

@@ -37,9 +37,7 @@ def checked(options: argparse.Namespace) -> argparse.Namespace:
     for name in ("instances", "seeds", "updates"):
         if getattr(options, name) < 1:
             raise UsageError(f"--{name} {getattr(options, name)}: at least 1 is needed")
-    for path in (options.json, options.figure):
-        if path is not None and not path.absolute().parent.is_dir():
-            raise UsageError(f"{path}: there is no folder {path.absolute().parent}")
+    cli.check_outs(json=options.json, figure=options.figure)
     return options
 
 
