@@ -17,9 +17,10 @@ from rtc_mjx import cache, cli, dataset
 from rtc_mjx.charts import save
 from rtc_mjx.errors import UsageError
 from rtc_mjx.figures import episode_of, paths
-from rtc_mjx.render import poses, rollouts
+from rtc_mjx.render import poses
 from rtc_mjx.runs import Run, by_method
 from rtc_mjx.scenes import Scene
+from rtc_mjx.trained import rollouts
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
 SIDE = 2.5  # inches, of a cell

@@ -16,19 +16,17 @@ import av
 import jax
 import mujoco
 import numpy as np
-from jax import random
 from jaxtyping import Float
 from rich.console import Console
 from rich.progress import Progress
 
-from rtc_mjx import cache, cli, dataset
+from rtc_mjx import cache, cli
 from rtc_mjx.camera import Picture, camera
 from rtc_mjx.errors import UsageError
-from rtc_mjx.keys import stream
 from rtc_mjx.physics import World, place_surroundings
 from rtc_mjx.runs import Run
 from rtc_mjx.scenes import Scene
-from rtc_mjx.trained import trained
+from rtc_mjx.trained import rollouts
 from rtc_mjx.trajectory import Demonstration, Episode, Trajectory
 
 PALETTE = ((0.93, 0.55, 0.15), (0.26, 0.62, 0.85), (0.62, 0.43, 0.80), (0.90, 0.76, 0.20), (0.42, 0.75, 0.42), (0.88, 0.45, 0.60))
@@ -36,41 +34,6 @@ EXPERT = (0.96, 0.96, 0.96)
 EVERY = 3  # control steps between two marks of a trail
 AWAY = -50.0  # m, below the ground: where marks wait for their time
 HOLD = 10  # frames for which the end of an episode stays
-
-
-def rollouts(run: Run, episodes: int, types: int, seed: int | None = None) -> tuple[Demonstration, Trajectory]:
-    """Test demonstrations, and rollouts of the run's last checkpoint in each under `types` draws of its test types.
-
-    Args:
-        run: trained.
-        episodes: how many.
-        types: rollouts of each.
-        seed: which of the run's seeds acts, by its own number; None for the first.
-
-    Returns:
-        The demonstrations, with a leading axis of episodes, and the rollouts, with leading axes (episodes, types).
-
-    Raises:
-        UsageError: the run has no such seed.
-    """
-    seeds = run.config.all_seeds
-    if seed is not None and seed not in seeds:
-        raise UsageError(f"--seed {seed}: {run.folder} has seeds {seeds[0]} to {seeds[-1]}")
-    seed_index = 0 if seed is None else seeds.index(seed)
-    held = trained(run)
-    config, learner = held.config, held.learner
-    test = dataset.demonstrations(config.scene, config.experts.test, dataset.TEST)
-    shown = jax.tree.map(lambda x: x[:episodes], test)
-    agent = learner.agent(jax.tree.map(lambda x: x[seed_index], held.networks))
-
-    def play(demonstration: Demonstration, key: jax.Array) -> Trajectory:
-        draw, noise = random.split(key)
-        g = learner.types(learner.method.test_types, agent, demonstration, draw).agent_type
-        return learner.play(agent, demonstration.episode, g, config.scene.key_each(noise))
-
-    keys = random.split(stream("evaluation", 0), (len(jax.tree.leaves(shown)[0]), types))
-    inner = jax.vmap(play, in_axes=(None, 0))
-    return shown, jax.device_get(jax.jit(jax.vmap(inner))(dataset.without_truth(shown), keys))
 
 
 def stage(scene: Scene, episode: Episode, actors: int, marks: int, size: tuple[int, int]) -> mujoco.MjModel:

@@ -21,6 +21,7 @@ from rtc_mjx.config import Config
 from rtc_mjx.errors import RunError, UsageError
 from rtc_mjx.runs import Run
 from rtc_mjx.scenes import SCENES
+from rtc_mjx.trained import rollouts
 
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = ["--scene", "double_goal", "--scene.steps", "16", "--updates", "40", "--batch", "16", "--model.width", "16"]
@@ -271,13 +272,13 @@ def test_populations_are_drawn_beside_experts_in_the_same_part_of_the_world(whol
     scene, shown, held = populations.of_runs([whole], 2, 3)
     assert list(held) == ["expert", "rtc_c"]
     assert {np.asarray(track.states.qpos).shape for track in held.values()} == {(2, 3, SCENE.steps + 1, 2)}
-    _, of_second = render.rollouts(whole, 2, 3, seed=1)
-    np.testing.assert_array_equal(render.rollouts(whole, 2, 3)[1].states.qpos, held["rtc_c"].states.qpos)
+    _, of_second = rollouts(whole, 2, 3, seed=1)
+    np.testing.assert_array_equal(rollouts(whole, 2, 3)[1].states.qpos, held["rtc_c"].states.qpos)
     assert not np.array_equal(of_second.states.qpos, held["rtc_c"].states.qpos)
     later = Run(whole.folder, dataclasses.replace(whole.config, first_seed=3))  # the seeds' own numbers, not their places
     for seed in (0, 5):
         with pytest.raises(UsageError, match=f"--seed {seed}: .* has seeds 3 to 4"):
-            render.rollouts(later, 2, 3, seed=seed)
+            rollouts(later, 2, 3, seed=seed)
     left, right, *_ = populations.draw(scene, shown, held).axes
     assert left.get_xlim() == right.get_xlim() and left.get_ylim() == right.get_ylim()
 
