@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from jax.tree_util import Partial
 from learning import SCENE, learner, settings
+from made import recordings
 from matplotlib.figure import Figure
 
 from rtc_mjx import carried, config, dataset, evaluate, probe, shift_report, type_shift
@@ -278,6 +279,21 @@ def test_the_analysis_of_types_says_what_is_there_to_say(method, tmp_path):
         type_shift.main(["--run", str(run.folder), "--probe", "8"])
     with pytest.raises(UsageError, match="--episodes 3"):
         type_shift.main(["--run", str(run.folder), "--episodes", "3"])
+
+
+@pytest.mark.usefixtures("quick_probe", "quick_to_compile")
+@pytest.mark.parametrize(("scene", "cars"), [("intersection", 2), ("womd", 1)])
+def test_the_analysis_of_types_on_driving(scene, cars, tmp_path):
+    """Several agents of an episode are agents each; recordings have one expert to an episode, and no signals that could be turned round."""
+    data = ("--scene.data", recordings("scenarionet_waymo")) if scene == "womd" else ("--scene.controlled", str(cars))
+    run = untrained(tmp_path / "run", "--scene.steps", "4", "--scene.road-users", "1", scene=scene, method="rtc_c", data=data)
+    result = analysed(run, "--episodes", "16")
+    check_types(result, cars * result["episodes"], "collision_rate")
+    drawn_again = scene != "womd"
+    assert ("realism" in result) == drawn_again == ("same_xi" in result["types"]) == ("reaction" in result)
+    assert set(result["left_out"]) >= (set() if drawn_again else {"realism"})
+    if drawn_again:
+        assert set(result["realism"]["features"]) == set(run.config.scene.described_by) and set(result["information"]) == {"xi", "mind"}
 
 
 def test_a_figure_holds_several_runs_and_leaves_out_what_none_has():
