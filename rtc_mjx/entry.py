@@ -212,7 +212,7 @@ def evaluated(run: Run, now: bool = True) -> bool:
 
 
 def shift_found(run: Run, episodes: int) -> bool:
-    """The same of the analysis of types, on as many episodes as were evaluated, and on as many experts as it should be."""
+    """Whether the analysis of types is that of the last update, by this code, on as many episodes and experts as it should be."""
     held = results.analysis(run)
     if (held.get("update"), held.get("episodes"), held.get("measured_by")) != (run.config.updates, episodes, provenance.measured_by()):
         return False

@@ -78,7 +78,7 @@ def write(runs: Mapping[str, Run], folder: Path, out: Path, pending: bool = Fals
 
 
 def write_failure(name: str, scene: str, error: RunError, folder: Path, out: Path, pending: bool) -> str:
-    """The same of an entry that came to nothing."""
+    """Writes that an entry failed, then all tables and figures of the folder; returns the tables."""
     with alone(folder):
         results.write_failure(out, name, scene, error)
         return rewritten(out, pending)

@@ -79,7 +79,21 @@ def opened(config: Config) -> Run:
 
 
 def learn(run: Run, config: Config, grid: Grid, team: Team) -> None:
-    """The training loop."""
+    """The training loop.
+
+    Args:
+        run: its directory, made or opened.
+        config: the settings.
+        grid: the devices.
+        team: the processes that train together.
+
+    Raises:
+        DivergedError: what is learned is not finite any more.
+        RunError: a checkpoint could not be written.
+        KeyboardInterrupt: interrupted; a checkpoint was saved first.
+    """
+    if team.leads:
+        sys.stderr.write(f"{run.folder}: demonstrations and a compiled program come first: minutes, unless kept from before\n")
     expert = dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN)
     learner = config.learner(dataset.statistics(config.scene, expert))
     state, update, before = begin_together(run, learner, config, team)

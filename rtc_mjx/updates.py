@@ -53,7 +53,7 @@ def start_all(learner: Learner, seeds: Sequence[int]) -> TrainState:
 
 
 def start_shapes(learner: Learner, seeds: Sequence[int]) -> TrainState:
-    """Their shapes and types: what a checkpoint is restored into."""
+    """Shapes and types of the states of all seeds: what a checkpoint is restored into."""
     return jax.eval_shape(functools.partial(start_all, learner, seeds))
 
 

@@ -83,7 +83,7 @@ def lost(name: str, of: str) -> Quantity:
 
 
 def gained(name: str, of: str) -> Quantity:
-    """The same of a metric of which less is better."""
+    """Conditional shift in a metric of which less is better: shuffled less paired."""
     return replace(
         metric(name, of, "shuffled") - metric(name, of, "paired"), text=f"{of}'s {name.replace('_', ' ')} added (shuffled - paired)"
     )
