@@ -32,6 +32,12 @@ from rtc_mjx.trajectory import Demonstration, Trajectory
 GENERATED = tuple(name for name, scene in SCENES.items() if issubclass(scene, Generated))
 
 
+@pytest.fixture(params=(*GENERATED, "womd"))
+def driving(request):
+    """Every driving scene: generated ones, and that of recordings."""
+    return made(request.param)
+
+
 @pytest.fixture(params=GENERATED)
 def scene(request):
     return made(request.param)
@@ -103,11 +109,11 @@ def test_a_point_of_a_route_is_taken_from_when_somebody_will_be_there(place, vel
 # Every driving scene
 
 
-def test_the_world_has_its_named_parts_and_two_cameras(scene):
-    names = [scene.world.mj.camera(i).name for i in range(scene.world.mj.ncam)]
+def test_the_world_has_its_named_parts_and_two_cameras(driving):
+    names = [driving.world.mj.camera(i).name for i in range(driving.world.mj.ncam)]
     assert {"car0/top", "car0/chase"} <= set(names)
-    assert scene.world.control_names == ("car0/drive", "car0/steer")
-    assert len(scene.world.users) == scene.road_users
+    assert driving.world.control_names == ("car0/drive", "car0/steer")
+    assert len(driving.world.users) == driving.road_users
 
 
 def test_experts_arrive_without_accident(scene):
@@ -140,11 +146,11 @@ def test_surroundings_do_not_depend_on_the_expert(scene):
     assert np.std(speeds) > 0.3 and np.std(ends[:, :2], axis=0).max() > 0.05
 
 
-def test_road_users_that_are_not_there_are_far_away_and_unseen(scene):
-    held, _ = demonstrated(scene.name)
+def test_road_users_that_are_not_there_are_far_away_and_unseen(driving):
+    held, _ = demonstrated(driving.name)
     gone = ~held.episode.context.present
     assert np.all(np.abs(held.episode.surroundings.pose[gone][:, :2]).max(axis=1) >= AWAY)
-    _, (_, users) = split_items(scene.sets, OWN, held.trajectory.observations)
+    _, (_, users) = split_items(driving.sets, OWN, held.trajectory.observations)
     assert np.all(users[gone] == 0)
 
 
@@ -166,19 +172,19 @@ def test_observations_do_not_depend_on_where_and_which_way_the_world_lies(scene)
 
 
 @pytest.mark.usefixtures("quick_to_compile")
-def test_gradients_are_finite_and_right_through_a_collision(scene, x64):
+def test_gradients_are_finite_and_right_through_a_collision(driving, x64):
     """The car runs into somebody who stands ahead: dx_T / da_t against central differences."""
-    episode = jax.tree.map(lambda x: jnp.asarray(x[0], float if x.dtype.kind == "f" else None), demonstrated(scene.name)[0].episode)
+    episode = jax.tree.map(lambda x: jnp.asarray(x[0], float if x.dtype.kind == "f" else None), demonstrated(driving.name)[0].episode)
     heading = episode.start.qpos[2]
     ahead = episode.start.qpos[:2] + 12 * jnp.stack([jnp.cos(heading), jnp.sin(heading)]) + jnp.array([0.3, 0.2])
     pose = episode.surroundings.pose.at[:, 0].set(jnp.concatenate([ahead, heading[None] + 0.3]))
     size = episode.surroundings.size.at[:, 0].set(jnp.array([4.5, 1.9]))
     episode = dataclasses.replace(episode, surroundings=type(episode.surroundings)(pose, size))
-    actions = jnp.tile(jnp.array([3.0, 0.01]), (scene.steps, 1))
+    actions = jnp.tile(jnp.array([3.0, 0.01]), (driving.steps, 1))
 
     @jax.jit
     def states(actions):
-        return rollout(scene, Actor((), lambda m, o, a: (m, a), actions), episode).states.qpos
+        return rollout(driving, Actor((), lambda m, o, a: (m, a), actions), episode).states.qpos
 
     def end(actions):
         return jnp.sum(states(actions)[20, :2])
