@@ -1,8 +1,9 @@
 """Tables and figures of results: `python -m rtc_mjx.report results/double_goal` makes all of them again, from the JSON files alone.
 
 `python -m rtc_mjx.report RUN... --out DIR` first takes the results of runs: a JSON file a method, then the same tables and figures:
-table.md, comparisons.md, claims.md, type_shift.md, conditional_realism.md, ablations.md, curves.png, overview.png, type_shift.png,
-conditional_realism.png, ablations.png, as far as there is something to show. Beside results of several scenes, claims.md of all of them.
+table.md, comparisons.md, claims.md, type_shift.md, conditional_realism.md, sim_agents.md, ablations.md, curves.png, overview.png,
+type_shift.png, conditional_realism.png, ablations.png, as far as there is something to show. Beside results of several studies, claims.md
+of all of them.
 """
 
 import argparse
@@ -24,6 +25,7 @@ TABLES: Mapping[str, Callable[[Mapping[str, Record], str], str]] = {
     "claims": lambda held, study: with_source(held, study, claims.table(next(iter(held.values()))["scene"], held)),
     "type_shift": tables.type_shift,
     "conditional_realism": tables.conditional_realism,
+    "sim_agents": tables.sim_agents,
     "ablations": tables.ablations,
 }
 
@@ -112,7 +114,7 @@ def of_results(folder: Path) -> str:
     """Makes tables and figures again of results/<name>, or of all that is in results."""
     if results.read(folder):
         text = rebuild(folder)
-        if (folder.resolve().parent / CLAIMS).is_file():
+        if any("study" in record for record in results.read(folder).values()):  # what `report` made of runs may stand anywhere
             rebuild_claims(folder.resolve().parent)
         return text
     places = studies(folder)

@@ -23,6 +23,11 @@ TESTED = (
     "Holm's correction is for all tests of one metric in the table."
 )
 
+SIM_AGENTS = (
+    "realism_meta_metric", "kinematic", "interactive", "map_based",
+    "simulated_collision_rate", "simulated_offroad_rate", "min_average_displacement_error",
+)  # fmt: skip
+
 Held = Mapping[str, Record]
 
 
@@ -130,6 +135,23 @@ def conditional_realism(held: Held, study: str) -> str:
         f"{first['episodes']} episodes. Floor: the same between two groups of experts, in the bins of that row. {OVER_SEEDS}"
     )
     return markdown(rows, left=1) + f"\n{told}\n\n{made_by(whole, study)}"
+
+
+def sim_agents(held: Held, study: str) -> str:
+    """The Sim Agents figures of methods on recorded scenes, under prior types, beside what log replay scores."""
+    whole = {name: record for name, record in results.methods(results.finished(held)).items() if "sim_agents" in record}
+    if not whole:
+        return ""
+    rows = [["method", *(name.replace("_", " ") for name in SIM_AGENTS)]]
+    for name, record in whole.items():
+        values = [[seed[figure] for seed in record["sim_agents"]["prior"] if figure in seed] for figure in SIM_AGENTS]
+        rows.append([name, *(number(found, spread=True) if found else "" for found in values)])
+    first = next(iter(whole.values()))
+    rows.append(["log replay", *(_plain(first["sim_agents"]["log_replay"].get(figure)) for figure in SIM_AGENTS)])
+    others = [name for name, record in whole.items() if not results.comparable(record, first)]
+    told = "Only the controlled agent is scored, under types of the prior (docs/metrics.md); log replay: in the scenes of the first row. "
+    told += f"Tested on other recordings than the first row: {', '.join(others)}. " if others else ""
+    return markdown(rows, left=1) + f"\n{told}{OVER_SEEDS}\n\n{made_by(whole, study)}"
 
 
 def ablations(held: Held, study: str) -> str:

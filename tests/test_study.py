@@ -30,6 +30,7 @@ from rtc_mjx import (
     report,
     results,
     study,
+    tables,
     train,
     type_shift,
     verdicts,
@@ -224,18 +225,29 @@ def test_methods_tested_on_other_recordings_are_not_compared():
     assert len(rows) == 1 and "tested on other recordings" in rows[0] and "not tested" in rows[0]
 
 
+def test_sim_agents_figures_stand_beside_log_replay():
+    figures = {name: 0.5 for name in tables.SIM_AGENTS}
+    held = {name: record(name, prior={"collision_rate": [0.1] * 2}) | {"scene": "womd"} for name in ("mgail", "symphony")}
+    for name, digest in (("mgail", "all"), ("symphony", "few")):
+        found = {"prior": [figures, figures | {"kinematic": 0.7}], "log_replay": figures | {"realism_meta_metric": 0.8}}
+        held[name] |= {"recordings": {"digest": digest}, "sim_agents": found}
+    text = report.TABLES["sim_agents"](held, "few")
+    rows = {line.split(" | ")[0].strip("| "): line.split(" | ") for line in text.splitlines() if line.startswith("| ")}
+    assert rows["mgail"][1].startswith("0.5 ± 0 ") and rows["mgail"][2].startswith("0.6 ± 0.14 ")
+    assert rows["log replay"][1:3] == ["0.8", "0.5"] and "other recordings than the first row: symphony." in text
+    assert report.TABLES["sim_agents"]({"mgail": record("mgail", prior={"return": [1.0]})}, "few") == ""
+
+
 def test_runs_are_not_reported_among_studies_nor_claims_beside_a_lone_one(tmp_path, monkeypatch):
     values = {"return": [1.0] * 4, "jsd_goal": [0.1] * 4}
     held = record("mgail", reference={"expert": {name: x[0] for name, x in values.items()}}, prior=values) | {"curves": {}}
     (tmp_path / "few").mkdir()
-    results.write(tmp_path / "few", "mgail", held)
+    results.write(tmp_path / "few", "mgail", {name: value for name, value in held.items() if name != "study"})
     report.main([str(tmp_path / "few")])
     assert not (tmp_path / "claims.md").exists()
-    report.main([str(tmp_path)])
-    before = (tmp_path / "claims.md").read_text()
-    (tmp_path / "claims.md").write_text("old")
+    results.write(tmp_path / "few", "mgail", held)
     report.main([str(tmp_path / "few")])
-    assert (tmp_path / "claims.md").read_text() == before
+    assert (tmp_path / "claims.md").is_file()
     monkeypatch.setattr(results, "of_run", lambda run: held)
     with pytest.raises(UsageError, match="holds studies .few.; name a folder of its own"):
         report.of_runs([SimpleNamespace(config=SimpleNamespace(scene=SimpleNamespace(name="double_goal"), method="mgail"))], tmp_path)
@@ -484,8 +496,8 @@ def test_tables_and_figures_are_made_again_from_the_json_files_alone(again, whol
 
 def test_committed_results_can_be_read(tmp_path):
     """Results of earlier versions, too, become tables."""
-    for place in ("double_goal", "intersection"):
-        shutil.copytree(ROOT / "results" / place, tmp_path / place)
+    for place in {file.parent for file in ROOT.glob("results/*/table.md")}:
+        shutil.copytree(place, tmp_path / place.name)
     report.main([str(tmp_path)])
     assert "| rtc_c | prior |" in (tmp_path / "intersection" / "table.md").read_text() and (tmp_path / "claims.md").is_file()
 
