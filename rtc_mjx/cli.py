@@ -50,7 +50,8 @@ def check_out(file: Path, ending: str, option: str = "--out") -> None:
         UsageError: its name ends otherwise, or its folder does not exist.
     """
     if file.suffix != ending or not file.absolute().parent.is_dir():
-        raise UsageError(f"{option} {file}: a file name that ends in {ending}, in a folder that exists, is needed")
+        told = f" that ends in {ending}" if ending else ""
+        raise UsageError(f"{option} {file}: a file name{told}, in a folder that exists, is needed")
 
 
 def check_outs(json: Path | None, figure: Path | None) -> None:
@@ -59,9 +60,10 @@ def check_outs(json: Path | None, figure: Path | None) -> None:
     Raises:
         UsageError: as `check_out`.
     """
-    for option, file, ending in (("--json", json, ".json"), ("--figure", figure, ".png")):
-        if file is not None:
-            check_out(file, ending, option)
+    if json is not None:  # of any name
+        check_out(json, json.suffix, "--json")
+    if figure is not None:
+        check_out(figure, ".png", "--figure")
 
 
 def console() -> Console:

@@ -112,9 +112,9 @@ def of_runs(runs: Sequence[Run], out: Path) -> str:
 
 def of_results(folder: Path) -> str:
     """Makes tables and figures again of results/<name>, or of all that is in results."""
-    if results.read(folder):
+    if held := results.read(folder):
         text = rebuild(folder)
-        if any("study" in record for record in results.read(folder).values()):  # what `report` made of runs may stand anywhere
+        if any("study" in record for record in held.values()):  # what `report` made of runs may stand anywhere
             rebuild_claims(folder.resolve().parent)
         return text
     places = studies(folder)
