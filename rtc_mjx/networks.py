@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
+from rtc_mjx.products import dot_general
 from rtc_mjx.scenes import ItemSet, split_items
 
 
@@ -40,7 +41,8 @@ class Layout:
 
 def linear(inputs: int, outputs: int, rngs: nnx.Rngs, scale: float = 1.0) -> nnx.Linear:
     """A layer whose outputs have a variance of `scale` times that of its inputs."""
-    return nnx.Linear(inputs, outputs, kernel_init=nnx.initializers.variance_scaling(scale, "fan_in", "truncated_normal"), rngs=rngs)
+    start = nnx.initializers.variance_scaling(scale, "fan_in", "truncated_normal")
+    return nnx.Linear(inputs, outputs, kernel_init=start, dot_general=dot_general, rngs=rngs)
 
 
 class MLP(nnx.Module):
