@@ -7,6 +7,7 @@ become one before the product, so that its gradients are products of two plain m
 
 from typing import Any
 
+import jax.numpy as jnp
 from jax import lax
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -35,8 +36,7 @@ def _by_rows(cotangent: Array, _rows: Any, matrix: Array, *, precision: Any) -> 
 def _over_batch(arrays: tuple[Array, Array], axes: tuple[int | None, int | None], *, precision: Any) -> tuple[Array, int]:
     (rows, matrix), (axis, of_matrix) = arrays, axes
     if of_matrix is None:
-        stacked = batching.bdim_at_front(rows, axis, rows.shape[axis])
-        return dot_general(stacked, matrix, precision=precision), 0
+        return dot_general(jnp.moveaxis(rows, axis or 0, 0), matrix, precision=precision), 0
     count = matrix.shape[of_matrix]
     rows, matrix = batching.bdim_at_front(rows, axis, count), batching.bdim_at_front(matrix, of_matrix, count)
     return lax.dot_general(rows, matrix, (((2,), (1,)), ((0,), (0,))), precision=precision), 0
