@@ -197,7 +197,12 @@ def critic_loss(learner: Learner, agent: Agent, batch: Demonstration, played: Pl
         "accuracy_expert": shared.mean_of(jnp.mean, real_logit > 0, learner.batch),
         "accuracy_policy": shared.mean_where(jnp.mean(fake_logit < 0, axis=1), played.alive),
     }
-    return entropy + learner.weights.discriminator_penalty * penalty, report
+    loss = entropy + learner.weights.discriminator_penalty * penalty
+    if learner.weights.discriminator_penalty_agent:
+        each = jax.vmap(functools.partial(gradient_penalty, agent))(*fake)
+        report["discriminator_penalty_agent"] = shared.mean_where(each, played.alive)
+        loss += learner.weights.discriminator_penalty_agent * report["discriminator_penalty_agent"]
+    return loss, report
 
 
 def branch_sizes(learner: Learner) -> Int[np.ndarray, "rows"]:

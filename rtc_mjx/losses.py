@@ -40,7 +40,8 @@ class LossWeights:
         type_kl_ramp: updates over which beta rises linearly from zero.
         type_info: InfoMGAIL's mutual-information term.
         type_nll: Symphony's label likelihood under its prior.
-        discriminator_penalty: R1 gradient penalty of the discriminator.
+        discriminator_penalty: R1 gradient penalty of the discriminator, on the expert's pairs.
+        discriminator_penalty_agent: the same on the agents' pairs (R2).
         kl_direction: which KL; 'posterior_prior' is E KL[e||p], 'prior_posterior' the paper's literal E KL[p||e].
     """
 
@@ -58,6 +59,7 @@ class LossWeights:
     type_info: float = 0.1
     type_nll: float = 1.0
     discriminator_penalty: float = 0.1
+    discriminator_penalty_agent: float = 0.0
     kl_direction: KlDirection = "posterior_prior"
 
     def total(self, losses: dict[str, Array], update: Array) -> Array:
@@ -165,7 +167,10 @@ CLOSED_LOOP = PATHWISE | {"policy_gradient", "value"}  # losses that read the ro
 
 
 def gradient_penalty(agent: Agent, observations: Array, actions: Array) -> Array:
-    """R1: mean squared norm of the logit's gradient with respect to the standardised inputs, on the expert's pairs."""
+    """Mean squared norm of the logit's gradient with respect to the standardised inputs: R1 on the expert's pairs, R2 on the agents'.
+
+    Mescheder et al., 2018, "Which Training Methods for GANs do actually Converge?", eq. 9 and 10.
+    """
     pairs = agent.pair(observations, actions)
     slope = jax.grad(lambda x: jnp.sum(agent.networks.discriminator(x)))(pairs)
     return jnp.mean(jnp.sum(slope**2, axis=-1))

@@ -9,6 +9,7 @@ import optax
 import pytest
 from flax import nnx
 from jax import random
+from jax.test_util import check_grads
 from learning import CLOSED_LOOP, ON_SCENE, SCENE, SCORED, begin, experts, learner
 
 from rtc_mjx import gradients as learning
@@ -58,7 +59,7 @@ def plain_rollouts(held, agent, batch, typed, key):
 
 @pytest.mark.parametrize("method", ON_SCENE)
 def test_two_stage_gradient_is_that_of_the_plain_loop(method, x64):
-    held = learner(method, weights=LossWeights(adversarial=0.7, adversarial_ramp=0, type_kl=0.1))
+    held = learner(method, weights=LossWeights(adversarial=0.7, adversarial_ramp=0, type_kl=0.1, discriminator_penalty_agent=0.05))
     state, batch = begin(held)
     ours, _ = jax.jit(lambda n: gradients(held, n, batch, random.key(3), jnp.array(0)))(state.networks)
     plain = jax.jit(jax.grad(lambda n: plain_loss(held, n, batch, random.key(3))))(state.networks)
@@ -115,6 +116,31 @@ def test_rollouts_of_both_branches_are_fakes_for_the_discriminator(method):
     )
     both = learning.critic_loss(held, agent, batch, played, random.key(3))[0]
     assert both == pytest.approx(float(first + second) / 2, rel=1e-5) and abs(float(first - second)) > 1e-6
+
+
+def test_discriminator_is_kept_smooth_where_experts_are_and_where_agents_are(x64):
+    """By the mean squared slope of the logit, over all that is finite; with its derivative by differences."""
+    held = learner("rtc_c")
+    state, batch = begin(held)
+    agent = held.agent(state.networks)
+    played, _ = learning.play_together(held, agent, batch, learning.infer(held, agent, batch, random.key(1)), random.key(2))
+    played = dataclasses.replace(played, alive=played.alive.at[3].set(False))
+
+    def loss(networks, **weights):
+        other = dataclasses.replace(held, weights=dataclasses.replace(held.weights, **weights))
+        return learning.critic_loss(other, held.agent(networks), batch, played, random.key(3))[0]
+
+    def slopes(tracks):
+        slope = jax.grad(lambda x: agent.networks.discriminator(x)[0])
+        pairs = agent.pair(tracks.observations[:, :-1], tracks.actions)
+        return jnp.sum(jax.vmap(jax.vmap(slope))(pairs) ** 2, axis=-1)
+
+    bare = {"discriminator_penalty": 0.0, "discriminator_penalty_agent": 0.0}
+    rest = loss(state.networks, **bare)
+    on_experts, on_agents = jnp.mean(slopes(batch.trajectory)), jnp.mean(slopes(played.tracks)[played.alive])
+    assert loss(state.networks, **bare | {"discriminator_penalty": 0.5}) - rest == pytest.approx(0.5 * float(on_experts), rel=1e-9)
+    assert loss(state.networks, **bare | {"discriminator_penalty_agent": 0.5}) - rest == pytest.approx(0.5 * float(on_agents), rel=1e-9)
+    check_grads(lambda n: loss(n, discriminator_penalty_agent=0.5), (state.networks,), order=1, modes=("rev",), eps=1e-6)
 
 
 @pytest.mark.parametrize("method", ["rtc_c", "rtc_d"])
