@@ -33,9 +33,9 @@ def dot(a: Float[Array, "*batch 2"], b: Float[Array, "*batch 2"]) -> Float[Array
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
 
 
-def length(vector: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
-    """Euclidean norm with a finite derivative at zero."""
-    return jnp.sqrt(dot(vector, vector) + 1e-12)
+def length(vector: Float[Array, "*batch space"]) -> Float[Array, "*batch"]:
+    """Euclidean norm, in the plane or in space, with a finite derivative at zero."""
+    return jnp.sqrt(sum(vector[..., i] ** 2 for i in range(vector.shape[-1])) + 1e-12)
 
 
 def resample(points: Float[Array, "points 2"], stations: Float[Array, "stations"]) -> Float[Array, "stations 2"]:
@@ -170,7 +170,10 @@ def shadow(size: Float[Array, "*batch 2"], turned: Float[Array, "*batch"]) -> Fl
 
 
 def closest_approach(place: Coordinates, velocity: Coordinates, horizon: float) -> tuple[Array, Array]:
-    """When, in s within the horizon, a point that goes straight on is closest to the origin, and how close, in m."""
+    """When, in s within the horizon, points that go straight on in the plane are closest to the origin, and how close, in m.
+
+    Place (x, y) and velocity are given by coordinate, each of any shape; results have that shape.
+    """
     (x, y), (u, v) = place, velocity
     soon = jnp.clip(-(x * u + y * v) / (u**2 + v**2 + 0.1), 0.0, horizon)
     return soon, jnp.sqrt((x + soon * u) ** 2 + (y + soon * v) ** 2 + 1e-12)

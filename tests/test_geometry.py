@@ -14,6 +14,26 @@ def one(pose):
     return jnp.array([pose], float), SIZE[None]
 
 
+def test_lengths_in_the_plane_and_in_space():
+    assert np.allclose(geometry.length(jnp.array([[3.0, 4.0], [0.0, 0.0]])), [5, 1e-6])
+    assert geometry.length(jnp.array([3.0, 4.0, 12.0])) == pytest.approx(13)
+    assert np.all(np.isfinite(jax.grad(geometry.length)(jnp.zeros(3))))
+
+
+@pytest.mark.parametrize(
+    ("place", "velocity", "soon", "close"),
+    [
+        ((-10.0, 3.0), (5.0, 0.0), 50 / 25.1, 3.0),  # passes 3 m to the side; the 0.1 in the denominator is for those who stand
+        ((-100.0, 0.0), (5.0, 0.0), 4.0, 80.0),  # not within the horizon
+        ((3.0, 4.0), (1.0, 1.0), 0.0, 5.0),  # goes away
+        ((3.0, 4.0), (0.0, 0.0), 0.0, 5.0),
+    ],
+)
+def test_closest_approach_of_who_goes_straight_on(place, velocity, soon, close):
+    when, how = geometry.closest_approach(place, velocity, 4.0)
+    assert when == pytest.approx(soon, abs=1e-5) and how == pytest.approx(close, abs=0.01)
+
+
 def test_a_polyline_is_resampled_by_its_arc_length():
     bent = jnp.array([[0.0, 0.0], [3.0, 0.0], [3.0, 0.0], [3.0, 4.0], [3.0, 4.0]])  # a point twice, as padding has it
     out = geometry.resample(bent, jnp.array([-1.0, 0.0, 2.0, 3.0, 5.0, 7.0, 9.0]))

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax import random
+from jax import lax, random
 
 from rtc_mjx.networks import Pool
 from rtc_mjx.products import dot_general
@@ -18,8 +18,8 @@ def through(product, rows, matrix):
 
 
 def penalty(product, rows, matrix):
-    """What a discriminator's penalty is: differentiated once already."""
-    return jnp.sum(jax.grad(through, argnums=1)(product, rows, matrix) ** 2)
+    """Differentiated once already, as a discriminator's penalty is by its rows."""
+    return sum(jnp.sum(slope**2) for slope in jax.grad(through, argnums=(1, 2))(product, rows, matrix))
 
 
 def plain(rows, matrix):
@@ -56,12 +56,29 @@ def test_gradient_by_the_matrix_sums_over_one_axis_of_rows():
     graph, weights = nnx.split(Pool(3, 2, 4, nnx.Rngs(0)))
     items, beside = jnp.ones((7, 6, 5, 3)), jnp.ones((7, 6, 2))
 
-    def loss(weights):
-        return jnp.sum(jax.vmap(jax.vmap(nnx.merge(graph, weights)))(items, beside))
+    def axes_summed(product):
+        def loss(weights):
+            net = nnx.merge(graph, weights)
+            for layer in (net.items.item, net.items.beside, net.items.second, net.score):
+                layer.dot_general = product
+            return jnp.sum(jax.vmap(jax.vmap(net))(items, beside))
 
-    jaxpr = str(jax.make_jaxpr(jax.grad(loss))(weights))
-    assert "rows_times_matrix" in jaxpr
-    assert "dimension_numbers=(([0, 1" not in jaxpr
+        equations = jax.make_jaxpr(jax.grad(loss))(weights).eqns
+        return max(len(e.params["dimension_numbers"][0][0]) for e in equations if e.primitive is lax.dot_general_p)
+
+    assert axes_summed(dot_general) == 1
+    assert axes_summed(lax.dot_general) > 1
+
+
+def test_other_products_are_refused():
+    with pytest.raises(ValueError, match="only rows times matrix"):
+        dot_general(ROWS, MATRIX[0], (((0,), (0,)), ((), ())))
+
+
+def test_no_rows_and_a_precision():
+    assert dot_general(ROWS[:0], MATRIX[0]).shape == (0, 6, 3)
+    exact = dot_general(ROWS, MATRIX[0], precision="highest")
+    np.testing.assert_allclose(exact, ROWS @ MATRIX[0], rtol=1e-6)
 
 
 def test_it_trains_beside_a_batch_of_matrices():

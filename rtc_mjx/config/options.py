@@ -145,5 +145,5 @@ def unread(method: str) -> frozenset[str]:
 
 
 def later(method: str) -> frozenset[str]:
-    """Settings that a run may lack since they came later: those its method does not read, and one whose default is what was before."""
-    return unread(method) | {"model.posterior_components"}
+    """Settings that a run may lack since they came later: those its method does not read, and those whose default is what was before."""
+    return unread(method) | {"model.posterior_components", "losses.discriminator_penalty_agent"}
