@@ -182,7 +182,7 @@ def branch_losses(
 
 
 def critic_loss(learner: Learner, agent: Agent, batch: Demonstration, played: Played, key: Array) -> tuple[Array, dict[str, Array]]:
-    """The discriminator's loss on demonstrations and on the rollouts of all branches, at random times; and its accuracies."""
+    """The discriminator's loss on demonstrations and on the rollouts of all branches, at random times; its accuracies and penalties."""
     steps = learner.scene.steps
     times = random.permutation(key, steps)[: learner.optimiser.discriminator_steps or steps]
     shared, tracks = learner.shared, (learner.by_agent(learner.shared.mine(batch, learner.batch)).trajectory, played.tracks)

@@ -41,7 +41,7 @@ class LossWeights:
         type_info: InfoMGAIL's mutual-information term.
         type_nll: Symphony's label likelihood under its prior.
         discriminator_penalty: R1 gradient penalty of the discriminator, on the expert's pairs.
-        discriminator_penalty_agent: the same on the agents' pairs (R2).
+        discriminator_penalty_agent: R2, that penalty on the agents' pairs; 0 leaves it out.
         kl_direction: which KL; 'posterior_prior' is E KL[e||p], 'prior_posterior' the paper's literal E KL[p||e].
     """
 
