@@ -75,8 +75,7 @@ def taken(points: Float[Array, "points 2"], others: Others) -> Float[Array, "poi
 
     One who passes at more than REACH counts as later by 1 s a metre, so that the number does not jump.
     """
-    away = tuple(others.pose[:, i] - points[:, i, None] for i in (0, 1))  # by coordinate: (points, others)
-    soon, closest = closest_approach(away, tuple(others.velocity.T), SOON)
+    soon, closest = jax.vmap(lambda point: closest_approach(others.pose[:, :2] - point, others.velocity, SOON))(points)
     when = jnp.where(others.present, soon + jnp.maximum(0.0, closest - REACH), SOON)
     return jnp.minimum(jnp.min(when, axis=1, initial=SOON), SOON)
 
@@ -92,7 +91,7 @@ def see_users(others: Others, pose: Float[Array, "3"], own_velocity: Float[Array
     heading = others.pose[:, 2] - pose[2]
     there = others.present & (lax.stop_gradient(jnp.max(jnp.abs(place), axis=1)) < FAR)
     gap = jnp.minimum(capsule_gap(pose, jnp.array(CAR), others.pose, others.size), NEAR)
-    soon, closest = closest_approach(tuple(place.T), tuple(rotate(others.velocity - own_velocity, turned).T), SOON)
+    soon, closest = closest_approach(place, rotate(others.velocity - own_velocity, turned), SOON)
     told = jnp.concatenate([
         place, jnp.cos(heading)[:, None], jnp.sin(heading)[:, None], rotate(others.velocity, turned), others.size,
         1.0 * (others.kind == PEDESTRIAN)[:, None], others.yaw_rate[:, None], jnp.stack([gap, soon, jnp.minimum(closest, NEAR)], axis=1),
