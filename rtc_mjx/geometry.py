@@ -7,6 +7,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from rtc_mjx.extrema import least
+
 Point = Float[Array, "2"]
 Pose = Float[Array, "3"]
 Coordinates = tuple[Array, ...]  # x, y and perhaps z, each of any shape
@@ -28,9 +30,14 @@ def cross(a: Float[Array, "*batch 2"], b: Float[Array, "*batch 2"]) -> Float[Arr
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-def length(vector: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
-    """Euclidean norm with a finite derivative at zero."""
-    return jnp.sqrt(jnp.sum(vector**2, axis=-1) + 1e-12)
+def dot(a: Float[Array, "*batch 2"], b: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
+    """Inner product. Written out: XLA fuses it with what surrounds it, and a sum over an axis of two it does not."""
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
+
+
+def length(vector: Float[Array, "*batch space"]) -> Float[Array, "*batch"]:
+    """Euclidean norm, in the plane or in space, with a finite derivative at zero."""
+    return jnp.sqrt(sum(vector[..., i] ** 2 for i in range(vector.shape[-1])) + 1e-12)
 
 
 def resample(points: Float[Array, "points 2"], stations: Float[Array, "stations"]) -> Float[Array, "stations 2"]:
@@ -63,12 +70,13 @@ def pose_at(path: Float[Array, "points 2"], spacing: float, station: Float[Array
 
 def project(path: Float[Array, "points 2"], spacing: float, point: Point) -> tuple[Array, Array, Array]:
     """The nearest point of a path: its station in m, how far to its left `point` lies in m, and the heading there."""
-    nearest = jnp.argmin(jnp.sum((lax.stop_gradient(point) - path) ** 2, axis=1))
+    away = lax.stop_gradient(point) - path
+    nearest = jnp.argmin(dot(away, away))
     ways = path[1:] - path[:-1]
     before, after = jnp.maximum(nearest - 1, 0), jnp.minimum(nearest, path.shape[0] - 2)
 
     def along(leg: Array) -> Array:
-        return jnp.sum((point - path[leg]) * ways[leg]) / jnp.sum(ways[leg] ** 2)
+        return dot(point - path[leg], ways[leg]) / dot(ways[leg], ways[leg])
 
     leg = jnp.where(along(after) >= 0, after, before)
     way = ways[leg]
@@ -99,7 +107,7 @@ def point_to_segment(point: Float[Array, "*batch 2"], a: Float[Array, "*batch 2"
 def _share(point: Float[Array, "*batch 2"], a: Float[Array, "*batch 2"], b: Float[Array, "*batch 2"]) -> Float[Array, "*batch"]:
     """Where the nearest point of the segment ab is: 0 at a, 1 at b."""
     way = b - a
-    return jnp.clip(jnp.sum((point - a) * way, axis=-1) / jnp.maximum(jnp.sum(way**2, axis=-1), 1e-12), 0, 1)
+    return jnp.clip(dot(point - a, way) / jnp.maximum(dot(way, way), 1e-12), 0, 1)
 
 
 def segment_distance(
@@ -108,7 +116,7 @@ def segment_distance(
     """Distance in m between the segments ab and cd; zero where they cross."""
     ends = [point_to_segment(a, c, d), point_to_segment(b, c, d), point_to_segment(c, a, b), point_to_segment(d, a, b)]
     split = (cross(b - a, c - a) * cross(b - a, d - a) < 0) & (cross(d - c, a - c) * cross(d - c, b - c) < 0)
-    return jnp.where(split, 0.0, jnp.min(jnp.stack(ends), axis=0))
+    return jnp.where(split, 0.0, least(jnp.stack(ends), axis=0))
 
 
 def capsule_gap(pose: Pose, size: Point, others: Float[Array, "n 3"], sizes: Float[Array, "n 2"]) -> Float[Array, "n"]:
@@ -163,12 +171,14 @@ def shadow(size: Float[Array, "*batch 2"], turned: Float[Array, "*batch"]) -> Fl
     return 0.5 * jnp.stack([along, across], axis=-1)
 
 
-def closest_approach(
-    place: Float[Array, "*batch 2"], velocity: Float[Array, "*batch 2"], horizon: float
-) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
-    """When, in s within the horizon, a point that goes straight on is closest to the origin, and how close, in m."""
-    soon = jnp.clip(-jnp.sum(place * velocity, axis=-1) / (jnp.sum(velocity**2, axis=-1) + 0.1), 0.0, horizon)
-    return soon, length(place + soon[..., None] * velocity)
+def closest_approach(place: Coordinates, velocity: Coordinates, horizon: float) -> tuple[Array, Array]:
+    """When, in s within the horizon, points that go straight on in the plane are closest to the origin, and how close, in m.
+
+    Place (x, y) and velocity are given by coordinate, each of any shape; results have that shape.
+    """
+    (x, y), (u, v) = place, velocity
+    soon = jnp.clip(-(x * u + y * v) / (u**2 + v**2 + 0.1), 0.0, horizon)
+    return soon, jnp.sqrt((x + soon * u) ** 2 + (y + soon * v) ** 2 + 1e-12)
 
 
 def off_road(

@@ -9,8 +9,10 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 from flax import nnx
+from jax import lax
 from jaxtyping import Array, Float
 
+from rtc_mjx.extrema import largest
 from rtc_mjx.products import dot_general
 from rtc_mjx.scenes import ItemSet, split_items
 
@@ -81,10 +83,10 @@ class Pool(nnx.Module):
         there = items[..., :1] > 0.5
         features = self.items(items, plain)
         score = jnp.where(there, self.score(features), -30.0)
-        share = jnp.exp(score - jnp.max(score, axis=-2, keepdims=True)) * there
+        share = jnp.exp(score - lax.stop_gradient(jnp.max(score, axis=-2, keepdims=True))) * there
         attended = jnp.sum(share * features, axis=-2) / jnp.maximum(jnp.sum(share, axis=-2), 1e-6)
-        largest = jnp.max(jnp.where(there, features, -1.0), axis=-2) * jnp.any(there, axis=-2)
-        return jnp.concatenate([attended, largest], axis=-1)
+        most = largest(jnp.where(there, features, -1.0), axis=-2) * jnp.any(there, axis=-2)
+        return jnp.concatenate([attended, most], axis=-1)
 
 
 class Reader(nnx.Module):

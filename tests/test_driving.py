@@ -21,11 +21,11 @@ from rtc_mjx.physics import PhysicsState, specialised_step, substates
 from rtc_mjx.rollout import rollout
 from rtc_mjx.scenes import SCENES, Actor, split_items
 from rtc_mjx.scenes.conduct import crossings, ran_red
-from rtc_mjx.scenes.driving import AWAY, CAR, OWN, nearest_users
+from rtc_mjx.scenes.driving import AWAY, CAR, nearest_users
 from rtc_mjx.scenes.generated import Generated
 from rtc_mjx.scenes.intersection import cycle
 from rtc_mjx.scenes.routes import BEHIND, NOWHERE, RouteOptions, find_routes
-from rtc_mjx.scenes.sight import SOON, Others, taken
+from rtc_mjx.scenes.sight import CLEAR, FINE, OWN, SOON, Others, see_itself, see_users, taken
 from rtc_mjx.scenes.traffic import Drivers, Walkers, drive, follow_the_leader, must_stop, slow_for_bends, walk
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
@@ -104,6 +104,37 @@ def test_a_point_of_a_route_is_taken_from_when_somebody_will_be_there(place, vel
     assert np.allclose(found, [when, SOON], atol=0.02)
     slope = jax.grad(lambda x: taken(jnp.array([[20.0, 0.0]]) + x, around(place, velocity, present))[0])(jnp.zeros(2))
     assert np.all(np.isfinite(slope))
+
+
+@pytest.mark.parametrize(
+    ("pose", "right", "left"),
+    [
+        ((20.0, 0.0, 0.0), 2.0 - CAR[1] / 2, 2.0 + CAR[1] / 2),  # along the edge at y = -2
+        ((20.0, -2.0, 0.0), -CAR[1] / 2, CAR[1] / 2),  # half of it past the edge
+        ((20.0, 0.0, np.pi), 2.0 + CAR[1] / 2, 2.0 - CAR[1] / 2),  # the other way round: the edge is to its left
+        ((20.0, 9.0, 0.0), CLEAR, CLEAR),
+    ],
+)
+def test_room_to_the_edge(pose, right, left):
+    """Corners in the order front left, front right, rear right, rear left."""
+    road, alone = straight_road().road, jnp.zeros((1, 14))
+    told = see_itself(jnp.array([*pose, 0.0]), jnp.zeros(4), road, alone)
+    assert told.shape == (OWN,)
+    assert np.allclose(told[4:8], np.minimum([left, right, right, left], CLEAR), atol=1e-5)
+    open_land = dataclasses.replace(road, edge_valid=jnp.zeros(1, bool))
+    assert np.allclose(see_itself(jnp.array([*pose, 0.0]), jnp.zeros(4), open_land, alone)[4:8], CLEAR)
+
+
+@pytest.mark.parametrize(
+    ("place", "gap"), [((8.0, 0.0), 8.0 - 0.5 * (CAR[0] + 4.0)), ((4.0, 0.0), 4.0 - 0.5 * (CAR[0] + 4.0)), ((50.0, 0.0), 99.0)]
+)
+def test_room_to_the_nearest_of_those_around(place, gap):
+    pose, still = jnp.zeros(3), jnp.zeros(2)
+    users = see_users(around(place, (0.0, 0.0)), pose, still)
+    told = see_itself(jnp.zeros(4), jnp.zeros(4), straight_road().road, users)
+    assert told[8] == pytest.approx(FINE * np.tanh(gap / FINE), abs=1e-4)
+    nobody = see_users(around(place, (0.0, 0.0), present=False), pose, still)
+    assert see_itself(jnp.zeros(4), jnp.zeros(4), straight_road().road, nobody)[8] == pytest.approx(FINE, abs=1e-4)
 
 
 # Every driving scene

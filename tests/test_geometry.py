@@ -30,7 +30,7 @@ def test_lengths_in_the_plane_and_in_space():
     ],
 )
 def test_closest_approach_of_who_goes_straight_on(place, velocity, soon, close):
-    when, how = geometry.closest_approach(jnp.array(place), jnp.array(velocity), 4.0)
+    when, how = geometry.closest_approach(place, velocity, 4.0)
     assert when == pytest.approx(soon, abs=1e-5) and how == pytest.approx(close, abs=0.01)
 
 

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from rtc_mjx.geometry import corners, off_road, project
-from rtc_mjx.logs import RED, RoadGraph
+from rtc_mjx.geometry import project
+from rtc_mjx.logs import RED
 from rtc_mjx.physics.car import CAR
 from rtc_mjx.scenes.routes import SPACING, Routes
-from rtc_mjx.scenes.sight import OFF_ROUTE
+from rtc_mjx.scenes.sight import OFF_ROUTE, past_edges
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
 PAST = 1.0  # m past a stop line, from where it counts as crossed
@@ -33,11 +33,6 @@ def conduct(demonstration: Demonstration, trajectory: Trajectory, touch: Array, 
         "ran_red": ran_red(road.routes, crossed),
         "decided": jnp.any(crossed),
     }
-
-
-def past_edges(pose: Float[Array, "3"], road: RoadGraph) -> Float[Array, "4"]:
-    """How far each corner of the car is past the nearest road edge, m; negative on the road."""
-    return jax.vmap(lambda corner: off_road(corner, road.edges, road.edge_valid))(corners(pose, jnp.array(CAR)))
 
 
 def bend(routes: Routes, point: Float[Array, "2"]) -> tuple[Array, Array]:

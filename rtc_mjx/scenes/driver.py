@@ -18,9 +18,8 @@ from jaxtyping import Array, Float
 
 from rtc_mjx.physics.car import CAR, WHEELBASE
 from rtc_mjx.scenes.base import Actor, split_items
-from rtc_mjx.scenes.driving import OWN
 from rtc_mjx.scenes.routes import Routes
-from rtc_mjx.scenes.sight import AHEAD
+from rtc_mjx.scenes.sight import AHEAD, OWN
 from rtc_mjx.scenes.traffic import COMFORT, GRIP, follow_the_leader
 
 if TYPE_CHECKING:

@@ -30,14 +30,13 @@ from rtc_mjx.physics.car import CAR, CONTROL_UNIT
 from rtc_mjx.pytree import pytree
 from rtc_mjx.scenes import scenery
 from rtc_mjx.scenes.base import Features, ItemSet, Ranges, Scene
-from rtc_mjx.scenes.conduct import conduct, on_branches, past_edges, span
+from rtc_mjx.scenes.conduct import conduct, on_branches, span
 from rtc_mjx.scenes.routes import SPACING, RouteOptions, Routes, find_routes
 from rtc_mjx.scenes.several import cars_apart, cars_together, the_others
-from rtc_mjx.scenes.sight import FAR, ROUTE, USER, Others, around_each, see_routes, see_users
+from rtc_mjx.scenes.sight import FAR, ROUTE, USER, Others, around_each, past_edges, see_itself, see_routes, see_users
 from rtc_mjx.trajectory import Demonstration, Episode, Trajectory
 
 CONTROL_EVERY = 3  # logged times a control step: 10 Hz to 3.3 Hz
-OWN = 4  # numbers of an observation about the car itself
 SAME_ROUTE = 0.05  # m, mean difference in distance from the path below which routes fit alike
 AWAY = 1e3  # m, where road users wait that are not there
 BINS = 100  # of the divergences (paper, section V-B)
@@ -259,10 +258,10 @@ class Driving(Scene):
         replayed = Others(around.pose, around.size, road.velocity[time], road.yaw_rate[time], road.kind, road.present[time])
 
         def see(routes: Routes, qpos: Array, qvel: Array, others: Others) -> Array:
-            pose = qpos[:3]
-            own = rotate(qvel[:2], -pose[2])
-            ahead = see_routes(routes, routes.signals[time], pose, others)
-            return jnp.concatenate([own, qvel[2:3], qpos[3:4], ahead.reshape(-1), see_users(others, pose, qvel[:2]).reshape(-1)])
+            speed = rotate(qvel[:2], -qpos[2])[0]
+            ahead = see_routes(routes, routes.signals[time], qpos[:3], speed, others)
+            users = see_users(others, qpos[:3], qvel[:2])
+            return jnp.concatenate([see_itself(qpos, qvel, road.graph, users), ahead.reshape(-1), users.reshape(-1)])
 
         cars = cars_apart(state, self.controlled)
         return self.each(see)(road.routes, cars.qpos, cars.qvel, around_each(replayed, cars, self.controlled))

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rtc_mjx.geometry import capsule_gap, closest_approach, pose_at, project, rotate, wrapped
-from rtc_mjx.logs import AMBER, GREEN, PEDESTRIAN, RED, VEHICLE
+from rtc_mjx.extrema import least
+from rtc_mjx.geometry import capsule_gap, closest_approach, corners, off_road, pose_at, project, rotate, wrapped
+from rtc_mjx.logs import AMBER, GREEN, PEDESTRIAN, RED, VEHICLE, RoadGraph
 from rtc_mjx.physics import PhysicsState
 from rtc_mjx.physics.car import CAR
 from rtc_mjx.pytree import pytree
@@ -14,11 +15,23 @@ from rtc_mjx.scenes.routes import BEHIND, SPACING, Routes
 from rtc_mjx.scenes.several import the_others
 
 AHEAD = (2.0, 5.0, 8.0, 12.0, 16.0, 20.0, 25.0, 30.0, 40.0, 50.0)  # m along a route, where it is looked at
-ROUTE, USER = 11 + 3 * len(AHEAD), 14  # numbers that are told of a route, and of somebody around
+OWN, ROUTE, USER = 9, 15 + 3 * len(AHEAD), 14  # numbers that are told of the car itself, of a route, and of somebody around
 FAR = 60.0  # m, beyond which nothing is told apart
 NEAR, SOON = 15.0, 5.0  # m and s, up to which it is told how close somebody is or will be
+GAP = 11  # which of the numbers of somebody around is the room in between
+FINE = 2.0  # m, within which what is close is told once more, by a number that varies little elsewhere
+CLEAR = 3.0  # m, beyond which a road edge is not seen
+CRAWL = 0.5  # m/s, at least as fast as which a car is taken to go on
 REACH = 2.5  # m around a point of a route, within which somebody is in the way
 OFF_ROUTE = 5.0  # m to the side, beyond which a route is no longer one's own
+
+
+def finely(metres: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """A distance that tells little but whether it is near zero: there its slope is one, and beyond FINE it hardly changes.
+
+    Networks see standardised numbers, and a smooth one cannot tell a touch from a metre of room by a number that goes from 0 to 60 m.
+    """
+    return FINE * jnp.tanh(metres / FINE)
 
 
 @pytree
@@ -42,12 +55,31 @@ class Others:
     present: Bool[Array, "*batch others"]
 
 
-def see_routes(routes: Routes, signals: Int[Array, "routes"], pose: Float[Array, "3"], others: Others) -> Float[Array, "routes 41"]:
-    """Each route from a pose.
+def past_edges(pose: Float[Array, "3"], road: RoadGraph) -> Float[Array, "4"]:
+    """How far each corner of the car is past the nearest road edge, m; negative on the road."""
+    return jax.vmap(lambda corner: off_road(corner, road.edges, road.edge_valid))(corners(pose, jnp.array(CAR)))
+
+
+def see_itself(qpos: Float[Array, "4"], qvel: Float[Array, "4"], road: RoadGraph, users: Float[Array, "others 14"]) -> Float[Array, "9"]:
+    """The car itself: its velocity forwards and to the left, yaw rate, steering angle, then the room that it has, in m.
+
+    That is, from each corner to the road edge (negative off the road, CLEAR at most either way; always CLEAR where a map has no road
+    edges), and to the nearest of those around (`finely`), as `see_users` tells of them.
+    """
+    room = jnp.clip(-past_edges(qpos[:3], road), -CLEAR, CLEAR)
+    gap = least(jnp.where(users[:, 0] > 0, users[:, GAP], NEAR), axis=0)
+    return jnp.concatenate([rotate(qvel[:2], -qpos[2]), qvel[2:3], qpos[3:4], room, finely(gap)[None]])
+
+
+def see_routes(
+    routes: Routes, signals: Int[Array, "routes"], pose: Float[Array, "3"], speed: Float[Array, ""], others: Others
+) -> Float[Array, "routes 45"]:
+    """Each route from a pose, at a speed forwards in m/s.
 
     Per route: 1 (there), m to its left, cosine and sine of the heading error, m to the stop line, red, amber, green, m to the
-    give-way line, and to whom it gives way (0, 1, 2), curvature 10 m ahead, then x and y of the points AHEAD in the car's frame, and
-    the s until somebody is there (`taken`). A route too far to the side is not there, unless it is the nearest.
+    give-way line, and to whom it gives way (0, 1, 2), curvature 10 m ahead, then x and y of the points AHEAD in the car's frame, the s
+    until somebody is there (`taken`), m from the car's nose to both lines (`finely`), and how narrowly the car would miss somebody, and
+    when (`near_miss`). A route too far to the side is not there, unless it is the nearest.
     """
 
     def see(path: Array, signal: Array, stop: Array, give_way: Array, whom: Array) -> tuple[Array, Array]:
@@ -61,7 +93,9 @@ def see_routes(routes: Routes, signals: Int[Array, "routes"], pose: Float[Array,
             aside, jnp.cos(off), jnp.sin(off), to_stop, 1.0 * (signal == RED), 1.0 * (signal == AMBER), 1.0 * (signal == GREEN),
             to_give, 1.0 * whom, bend,
         ])  # fmt: skip
-        return jnp.concatenate([told, seen.reshape(-1), taken(points[:, :2], others)]), jnp.abs(aside)
+        close = finely(jnp.stack([to_stop, to_give]) - CAR[0] / 2)
+        when = taken(points[:, :2], others)
+        return jnp.concatenate([told, seen.reshape(-1), when, close, near_miss(speed, when)]), jnp.abs(aside)
 
     told, aside = jax.vmap(see)(routes.paths, signals, routes.stop, routes.give_way, routes.gives_way_to)
     aside = lax.stop_gradient(jnp.where(routes.valid, aside, jnp.inf))
@@ -75,9 +109,24 @@ def taken(points: Float[Array, "points 2"], others: Others) -> Float[Array, "poi
 
     One who passes at more than REACH counts as later by 1 s a metre, so that the number does not jump.
     """
-    soon, closest = jax.vmap(lambda point: closest_approach(others.pose[:, :2] - point, others.velocity, SOON))(points)
+    away = tuple(others.pose[:, i] - points[:, i, None] for i in (0, 1))  # by coordinate: (points, others)
+    soon, closest = closest_approach(away, tuple(others.velocity.T), SOON)
     when = jnp.where(others.present, soon + jnp.maximum(0.0, closest - REACH), SOON)
-    return jnp.minimum(jnp.min(when, axis=1, initial=SOON), SOON)
+    return jnp.minimum(least(when, axis=1), SOON)
+
+
+def near_miss(speed: Float[Array, ""], when: Float[Array, "points"]) -> Float[Array, "2"]:
+    """At the point of a route where the car, going on as fast as it does, would miss somebody most narrowly: by how much, and when, in s.
+
+    The first is the time between the car and the first of the others there, whoever comes first (the post-encroachment time of traffic
+    safety, as expected), the second the time until the car is there. Both are SOON where nobody comes near the route, and at most.
+    """
+    mine = jnp.array(AHEAD) / jnp.maximum(speed, CRAWL)
+    between = jnp.where(when < SOON, jnp.minimum(jnp.abs(mine - when), SOON), SOON)
+    margin = least(between, axis=0)
+    here = lax.stop_gradient(jnp.arange(len(AHEAD)) == jnp.argmin(between))
+    at = jnp.minimum(jnp.sum(jnp.where(here, mine, 0.0)), SOON)
+    return jnp.stack([margin, jnp.where(margin < SOON, at, SOON)])
 
 
 def see_users(others: Others, pose: Float[Array, "3"], own_velocity: Float[Array, "2"]) -> Float[Array, "others 14"]:
@@ -91,7 +140,7 @@ def see_users(others: Others, pose: Float[Array, "3"], own_velocity: Float[Array
     heading = others.pose[:, 2] - pose[2]
     there = others.present & (lax.stop_gradient(jnp.max(jnp.abs(place), axis=1)) < FAR)
     gap = jnp.minimum(capsule_gap(pose, jnp.array(CAR), others.pose, others.size), NEAR)
-    soon, closest = closest_approach(place, rotate(others.velocity - own_velocity, turned), SOON)
+    soon, closest = closest_approach(tuple(place.T), tuple(rotate(others.velocity - own_velocity, turned).T), SOON)
     told = jnp.concatenate([
         place, jnp.cos(heading)[:, None], jnp.sin(heading)[:, None], rotate(others.velocity, turned), others.size,
         1.0 * (others.kind == PEDESTRIAN)[:, None], others.yaw_rate[:, None], jnp.stack([gap, soon, jnp.minimum(closest, NEAR)], axis=1),
