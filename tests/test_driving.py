@@ -25,7 +25,7 @@ from rtc_mjx.scenes.driving import AWAY, CAR, nearest_users
 from rtc_mjx.scenes.generated import Generated
 from rtc_mjx.scenes.intersection import cycle
 from rtc_mjx.scenes.routes import BEHIND, NOWHERE, RouteOptions, find_routes
-from rtc_mjx.scenes.sight import CLEAR, FINE, OWN, SOON, Others, see_itself, see_users, taken
+from rtc_mjx.scenes.sight import CLEAR, FINE, OWN, SOON, Others, near_miss, see_itself, see_users, taken
 from rtc_mjx.scenes.traffic import Drivers, Walkers, drive, follow_the_leader, must_stop, slow_for_bends, walk
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
@@ -135,6 +135,25 @@ def test_room_to_the_nearest_of_those_around(place, gap):
     assert told[8] == pytest.approx(FINE * np.tanh(gap / FINE), abs=1e-4)
     nobody = see_users(around(place, (0.0, 0.0), present=False), pose, still)
     assert see_itself(jnp.zeros(4), jnp.zeros(4), straight_road().road, nobody)[8] == pytest.approx(FINE, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("speed", "when", "margin", "at"),
+    [
+        (5.0, {}, SOON, SOON),  # nobody comes near
+        (5.0, {4: 2.2}, 1.0, 3.2),  # somebody is at 16 m a second before the car
+        (5.0, {4: 4.2}, 1.0, 3.2),  # or a second after it
+        (5.0, {2: 1.1, 4: 4.2}, 0.5, 1.6),  # the narrower of two
+        (0.0, {0: 0.5}, 3.5, 4.0),  # who stands is taken to crawl
+        (0.0, {4: 0.5}, SOON, SOON),  # but not that far
+        (50.0, {9: 1.0}, 0.0, 1.0),
+    ],
+)
+def test_how_narrowly_somebody_is_missed_and_when(speed, when, margin, at):
+    taken_from = jnp.full(10, SOON).at[jnp.array(list(when), int)].set(jnp.array(list(when.values())))
+    assert np.allclose(near_miss(jnp.array(speed), taken_from), [margin, at], atol=1e-5)
+    slope = jax.jacrev(near_miss, argnums=(0, 1))(jnp.array(speed), taken_from)
+    assert all(np.all(np.isfinite(x)) for x in slope)
 
 
 # Every driving scene
@@ -378,7 +397,7 @@ def test_an_agent_that_the_log_has_off_the_road_is_masked():
 
 def by_hand(**given):
     """Features of a sample of four agents who did nothing, but for what is given."""
-    nothing = {name: np.zeros((1, 4)) for name in ("collision", "overlap", "offroad", "ade", "progress", "ran_red")}
+    nothing = {name: np.zeros((1, 4)) for name in ("collision", "overlap", "offroad", "ade", "progress", "turned", "ran_red")}
     nothing |= {"may_leave_road": np.ones((1, 4), bool), "curvature": np.zeros((1, 4, 3)), "branching": np.zeros((1, 4, 3), bool)}
     return nothing | {name: np.array(x)[None] for name, x in given.items()}
 
@@ -396,6 +415,15 @@ def test_divergences_of_progress_and_of_curvature_where_lanes_branch():
     found = made("intersection").metrics(near, there)
     assert found["progress_jsd"] == pytest.approx(expected) and found["curvature_jsd"] == pytest.approx(expected)
     assert made("intersection").metrics(by_hand(progress=[5.0] * 4), there)["progress_jsd"] == pytest.approx(1)
+
+
+def test_divergence_of_manoeuvres_is_that_of_left_right_and_neither():
+    """Experts turn left, right, and twice not at all; who never turns diverges from p = (1/4, 1/2, 1/4) by q = (0, 1, 0)."""
+    there, never = by_hand(turned=[1.5, -1.5, 0.1, -0.2]), by_hand(turned=[0.2, -0.3, 0.0, 0.34])
+    expected = 0.5 * (2 * 0.25 * np.log2(0.25 / 0.125) + 0.5 * np.log2(0.5 / 0.75) + np.log2(1 / 0.75))
+    metrics = made("intersection").metrics
+    assert metrics(never, there)["manoeuvre_jsd"] == pytest.approx(expected)
+    assert metrics(by_hand(turned=[0.4, -3.0, 0.0, 0.0]), there)["manoeuvre_jsd"] == 0.0
 
 
 def test_a_lane_branches_off_where_another_goes_on_from_the_same_lane():

@@ -304,7 +304,9 @@ def test_symphony_leaves_out_recordings_that_do_not_log_connectivity_and_says_ho
 
 
 def test_curvature_is_left_out_only_where_no_recording_logs_connectivity(mixed):
-    held = {name: np.zeros((1, 2)) for name in ("collision", "overlap", "offroad", "may_leave_road", "ade", "progress", "ran_red")}
+    held = {
+        name: np.zeros((1, 2)) for name in ("collision", "overlap", "offroad", "may_leave_road", "ade", "progress", "turned", "ran_red")
+    }
     held |= {"curvature": np.array([[[0.1, 0.2], [9.0, 9.0]]]), "branching": np.array([[[True, True], [False, False]]])}
     assert Recorded(data=str(mixed)).metrics(held, held)["curvature_jsd"] == 0.0
     (mixed / "shard").unlink()

@@ -225,7 +225,7 @@ def test_several_experts_arrive_without_accident():
 
 def test_min_ade_is_each_agents_own_best_sample():
     scene = Intersection(controlled=2)
-    expert = {name: np.zeros((2, 2)) for name in ("collision", "overlap", "offroad", "ade", "progress", "ran_red")}
+    expert = {name: np.zeros((2, 2)) for name in ("collision", "overlap", "offroad", "ade", "progress", "turned", "ran_red")}
     expert |= {"curvature": np.zeros((2, 2, 3)), "branching": np.zeros((2, 2, 3), bool), "may_leave_road": np.ones((2, 2), bool)}
     one = {name: x[None] for name, x in expert.items()}
     two = {name: np.stack([x, x]) for name, x in expert.items()} | {"ade": np.array([[[1.0, 4.0], [2.0, 3.0]], [[3.0, 2.0], [1.0, 5.0]]])}

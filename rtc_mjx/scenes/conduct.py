@@ -12,6 +12,7 @@ from rtc_mjx.scenes.routes import SPACING, Routes
 from rtc_mjx.scenes.sight import OFF_ROUTE, past_edges
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
+TURN = 0.35  # rad between the first and the last heading, from where a car has turned
 PAST = 1.0  # m past a stop line, from where it counts as crossed
 
 
@@ -27,6 +28,7 @@ def conduct(demonstration: Demonstration, trajectory: Trajectory, touch: Array, 
         "offroad": jnp.mean(past),
         "may_leave_road": jnp.any(road.graph.edge_valid) & ~road.starts_off_road,
         "ade": jnp.mean(jnp.sqrt(jnp.sum((qpos - demonstration.trajectory.states.qpos)[:, :2] ** 2, axis=1))),
+        "turned": qpos[-1, 2] - qpos[0, 2],
         "progress": jnp.sqrt(jnp.sum((qpos[-1] - qpos[0])[:2] ** 2)),
         "curvature": bends,
         "branching": branching,
@@ -63,6 +65,12 @@ def span(values: np.ndarray) -> tuple[float, float]:
     """The range of values, never empty."""
     low, high = (float(np.min(values)), float(np.max(values))) if values.size else (0.0, 1.0)
     return low, max(high, low + 1e-6)
+
+
+def manoeuvre(features: dict[str, np.ndarray]) -> np.ndarray:
+    """Whether it turned left (1), right (-1), or neither (0), by how its heading changed from first to last."""
+    turned = features["turned"]
+    return np.where(np.abs(turned) > TURN, np.sign(turned), 0.0)
 
 
 def on_branches(features: dict[str, np.ndarray]) -> np.ndarray:

@@ -30,7 +30,7 @@ from rtc_mjx.physics.car import CAR, CONTROL_UNIT
 from rtc_mjx.pytree import pytree
 from rtc_mjx.scenes import scenery
 from rtc_mjx.scenes.base import Features, ItemSet, Ranges, Scene
-from rtc_mjx.scenes.conduct import conduct, on_branches, span
+from rtc_mjx.scenes.conduct import conduct, manoeuvre, on_branches, span
 from rtc_mjx.scenes.routes import SPACING, RouteOptions, Routes, find_routes
 from rtc_mjx.scenes.several import cars_apart, cars_together, the_others
 from rtc_mjx.scenes.sight import FAR, ROUTE, USER, Others, around_each, past_edges, see_itself, see_routes, see_users
@@ -312,7 +312,7 @@ class Driving(Scene):
         return jnp.mean(jnp.where(off < 1, 0.5 * off**2, off - 0.5))
 
     def features(self, demonstration: Demonstration, trajectory: Trajectory) -> dict[str, Array]:
-        """Of each car: collisions, time off the road, distance from the expert, progress, curvature where lanes branch, reds run."""
+        """Of each car: collisions, time off the road, distance from the expert, turn, progress, curvature where lanes branch, reds."""
         episode = demonstration.episode
         expert = self.views(Demonstration(episode, demonstration.trajectory, ()))
         return self.each(conduct)(expert, self.apart(trajectory), *self.encounters(episode, trajectory))
@@ -353,6 +353,7 @@ class Driving(Scene):
             "min_ade": float(np.mean(np.min(features["ade"], axis=0))),
             "curvature_jsd": metrics.jsd(here, there, bins=BINS, limits=limits["curvature"]),
             "progress_jsd": metrics.jsd(features["progress"], expert["progress"], bins=BINS, limits=limits["progress"]),
+            "manoeuvre_jsd": metrics.jsd(manoeuvre(features), manoeuvre(expert), bins=3, limits=(-1.5, 1.5)),
             "ran_red_rate": float(np.mean(features["ran_red"])),
         }
 
