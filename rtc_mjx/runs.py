@@ -167,7 +167,7 @@ class Run:
         A damaged one is passed over, with a warning, for the one before.
 
         Raises:
-            UsageError: there is no whole one.
+            UsageError: there is no whole one, or it is of a version of this code whose networks have other shapes.
         """
         failed = []
         for update in self.checkpoints():
@@ -176,6 +176,10 @@ class Run:
                     state, notes = self._read(update, like)
                 except MemoryError:
                     raise
+                except _OtherShapesError as error:
+                    raise UsageError(
+                        f"{self.folder} was trained by a version whose agents see or hold other numbers: {error}; train anew"
+                    ) from error
                 except Exception as error:  # orbax and tensorstore raise bare Exceptions for damaged files
                     failed.append(f"checkpoint {update} cannot be read ({_first_line(error)})")
                     continue
@@ -195,12 +199,24 @@ class Run:
     def _read(self, update: int, like: Any) -> tuple[Any, dict[str, Any]]:
         ocp = _orbax()
         wanted = ocp.args.Composite(state=ocp.args.StandardRestore(jax.eval_shape(lambda: _named(like))), notes=ocp.args.JsonRestore())
+        held, asked = self._shapes(update), [leaf.shape for leaf in jax.tree.leaves(like)]
+        if held != asked:
+            first = next(
+                (f"{a} where {b} is asked for" for a, b in zip(held, asked, strict=False) if a != b), f"{len(held)} for {len(asked)} arrays"
+            )
+            raise _OtherShapesError(f"checkpoint {update} has {first}")
         with _manager(self.folder / "checkpoints") as manager:
             found = manager.restore(update, args=wanted)
         state = jax.tree.unflatten(jax.tree.structure(like), [found.state[name] for name in sorted(found.state)])
         if _digest(state) != found.notes["digest"]:
             raise ValueError("its numbers are not those that were written")
         return state, found.notes
+
+    def _shapes(self, update: int) -> list[tuple[int, ...]]:
+        """Of the arrays of a checkpoint's state."""
+        known = _orbax().StandardCheckpointHandler().metadata((self.folder / "checkpoints" / str(update) / "state").absolute())
+        leaves = known.tree
+        return [tuple(leaves[name].shape) for name in sorted(leaves)]
 
     def set_aside_after(self, update: int) -> None:
         """Renames checkpoints later than an update (they could not be read), so that new ones can stand there."""
@@ -274,6 +290,10 @@ def _orbax() -> Any:
 
     logging.getLogger("absl").setLevel(logging.ERROR)
     return orbax.checkpoint
+
+
+class _OtherShapesError(Exception):
+    """A checkpoint is whole, but not of networks of these shapes."""
 
 
 def _manager(folder: Path) -> Any:

@@ -151,6 +151,14 @@ def test_altered_checkpoint_is_not_believed(whole, tmp_path, monkeypatch):
         evaluate.evaluate(run, 16)
 
 
+def test_a_run_of_networks_of_other_shapes_is_refused_for_what_it_is(whole, tmp_path):
+    run = copy(whole, tmp_path)
+    file = run.folder / "config.json"
+    file.write_text(file.read_text().replace(f'"width": {whole.config.model.width}', f'"width": {whole.config.model.width + 1}'))
+    with pytest.raises(UsageError, match=r"trained by a version .* where \(.*\) is asked for; train anew"):
+        evaluate.evaluate(Run.open(run.folder), 16)
+
+
 def test_metrics_cut_short_by_a_crash_lose_only_the_last_line(whole, tmp_path):
     run = copy(whole, tmp_path)
     with run.metrics_file.open("a") as file:
