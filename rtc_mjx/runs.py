@@ -167,7 +167,7 @@ class Run:
         A damaged one is passed over, with a warning, for the one before.
 
         Raises:
-            UsageError: there is no whole one, or it is of a version of this code whose networks have other shapes.
+            UsageError: there is no whole one, or its networks have other shapes than those that the settings make.
         """
         failed = []
         for update in self.checkpoints():
@@ -178,7 +178,8 @@ class Run:
                     raise
                 except _OtherShapesError as error:
                     raise UsageError(
-                        f"{self.folder} was trained by a version whose agents see or hold other numbers: {error}; train anew"
+                        f"{self.folder} was trained by other code or settings than these: {error}; use the code that {TRAINED_BY} names, "
+                        "or train anew (another --run, in a study another --name)"
                     ) from error
                 except Exception as error:  # orbax and tensorstore raise bare Exceptions for damaged files
                     failed.append(f"checkpoint {update} cannot be read ({_first_line(error)})")
@@ -202,7 +203,8 @@ class Run:
         held, asked = self._shapes(update), [leaf.shape for leaf in jax.tree.leaves(like)]
         if held != asked:
             first = next(
-                (f"{a} where {b} is asked for" for a, b in zip(held, asked, strict=False) if a != b), f"{len(held)} for {len(asked)} arrays"
+                (f"an array of {a} where config.json asks for {b}" for a, b in zip(held, asked, strict=False) if a != b),
+                f"{len(held)} for {len(asked)} arrays",
             )
             raise _OtherShapesError(f"checkpoint {update} has {first}")
         with _manager(self.folder / "checkpoints") as manager:
@@ -293,7 +295,7 @@ def _orbax() -> Any:
 
 
 class _OtherShapesError(Exception):
-    """A checkpoint is whole, but not of networks of these shapes."""
+    """The arrays of a checkpoint have other shapes than those of the networks that the settings make."""
 
 
 def _manager(folder: Path) -> Any:

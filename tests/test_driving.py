@@ -14,6 +14,7 @@ from made import demonstrated, made
 from rtc_mjx import dataset, evaluate, train
 from rtc_mjx.config import Config, Experts, Intervals
 from rtc_mjx.errors import UsageError
+from rtc_mjx.geometry import project
 from rtc_mjx.learner import OptimiserOptions
 from rtc_mjx.logs import AMBER, GREEN, NO_SIGNAL, RED, VEHICLE, LoggedScene, RoadGraph, checked
 from rtc_mjx.models import ModelOptions
@@ -24,8 +25,8 @@ from rtc_mjx.scenes.conduct import crossings, ran_red
 from rtc_mjx.scenes.driving import AWAY, CAR, nearest_users
 from rtc_mjx.scenes.generated import Generated
 from rtc_mjx.scenes.intersection import cycle
-from rtc_mjx.scenes.routes import BEHIND, NOWHERE, RouteOptions, find_routes
-from rtc_mjx.scenes.sight import CLEAR, FINE, OWN, SOON, Others, near_miss, see_itself, see_users, taken
+from rtc_mjx.scenes.routes import BEHIND, NOWHERE, SPACING, RouteOptions, find_routes
+from rtc_mjx.scenes.sight import CLEAR, FINE, OWN, SOON, Others, near_miss, see_itself, see_routes, see_users, taken
 from rtc_mjx.scenes.traffic import Drivers, Walkers, drive, follow_the_leader, must_stop, slow_for_bends, walk
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
@@ -154,6 +155,18 @@ def test_how_narrowly_somebody_is_missed_and_when(speed, when, margin, at):
     assert np.allclose(near_miss(jnp.array(speed), taken_from), [margin, at], atol=1e-5)
     slope = jax.jacrev(near_miss, argnums=(0, 1))(jnp.array(speed), taken_from)
     assert all(np.all(np.isfinite(x)) for x in slope)
+
+
+def test_a_route_tells_of_its_lines_finely_and_of_near_misses():
+    """A car at 20 m and 5 m/s; its stop line 10 m ahead, the give-way line 4 m, and somebody who crosses at 16 m in 4.2 s."""
+    scene, log = made("intersection"), straight_road()
+    routes = scene.episode(log).context.routes
+    station = project(routes.paths[0], SPACING, jnp.array([20.0, 0.0]))[0]
+    routes = dataclasses.replace(routes, stop=routes.stop.at[0].set(station + 10.0), give_way=routes.give_way.at[0].set(station + 4.0))
+    signals, who = routes.signals[0], around((36.0, -21.0), (0.0, 5.0))
+    told = see_routes(routes, signals, jnp.array([20.0, 0.0, 0.0]), jnp.array(5.0), who)[0]
+    nose = CAR[0] / 2
+    assert np.allclose(told[-4:], [FINE * np.tanh((10 - nose) / FINE), FINE * np.tanh((4 - nose) / FINE), 1.0, 3.2], atol=0.03)
 
 
 # Every driving scene

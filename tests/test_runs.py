@@ -155,8 +155,13 @@ def test_a_run_of_networks_of_other_shapes_is_refused_for_what_it_is(whole, tmp_
     run = copy(whole, tmp_path)
     file = run.folder / "config.json"
     file.write_text(file.read_text().replace(f'"width": {whole.config.model.width}', f'"width": {whole.config.model.width + 1}'))
-    with pytest.raises(UsageError, match=r"trained by a version .* where \(.*\) is asked for; train anew"):
+    with pytest.raises(
+        UsageError, match=r"other code or settings .* an array of \(.*\) where config.json asks for \(.*\); .* train anew"
+    ) as caught:
         evaluate.evaluate(Run.open(run.folder), 16)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(UsageError, match="other code or settings"):
+        train.train(dataclasses.replace(Run.open(run.folder).config, resume=True))
 
 
 def test_metrics_cut_short_by_a_crash_lose_only_the_last_line(whole, tmp_path):

@@ -12,7 +12,7 @@ from rtc_mjx.scenes.routes import SPACING, Routes
 from rtc_mjx.scenes.sight import OFF_ROUTE, past_edges
 from rtc_mjx.trajectory import Demonstration, Trajectory
 
-TURN = 0.35  # rad between the first and the last heading, from where a car has turned
+TURN = 0.35  # rad, the change of heading beyond which a car has turned
 PAST = 1.0  # m past a stop line, from where it counts as crossed
 
 

@@ -249,7 +249,7 @@ class Driving(Scene):
         return cars_together(PhysicsState(qpos, qvel, cars.warmstart), self.controlled)
 
     def observe(self, episode: Episode, time: Array, state: PhysicsState) -> Float[Array, "*agents features"]:
-        """Of each car its own motion, then the routes ahead of it, then those around it, in its own frame; see `see_routes`, `see_users`.
+        """Of each car its own motion and room, then the routes ahead, then those around it: `see_itself`, `see_routes`, `see_users`.
 
         Those around it are the road users, and after them the other cars that are driven.
         """

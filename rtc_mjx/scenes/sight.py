@@ -1,4 +1,4 @@
-"""What a driver sees, in its own frame: the routes ahead, and those around it, replayed or driven by others."""
+"""What a driver sees, in its own frame: itself and the room it has, the routes ahead, and those around it, replayed or driven by others."""
 
 import jax
 import jax.numpy as jnp
@@ -19,15 +19,15 @@ OWN, ROUTE, USER = 9, 15 + 3 * len(AHEAD), 14  # numbers that are told of the ca
 FAR = 60.0  # m, beyond which nothing is told apart
 NEAR, SOON = 15.0, 5.0  # m and s, up to which it is told how close somebody is or will be
 GAP = 11  # which of the numbers of somebody around is the room in between
-FINE = 2.0  # m, within which what is close is told once more, by a number that varies little elsewhere
+FINE = 2.0  # m, the scale of `finely`
 CLEAR = 3.0  # m, beyond which a road edge is not seen
-CRAWL = 0.5  # m/s, at least as fast as which a car is taken to go on
+CRAWL = 0.5  # m/s, the least speed at which a car is taken to go on
 REACH = 2.5  # m around a point of a route, within which somebody is in the way
 OFF_ROUTE = 5.0  # m to the side, beyond which a route is no longer one's own
 
 
 def finely(metres: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """A distance that tells little but whether it is near zero: there its slope is one, and beyond FINE it hardly changes.
+    """A distance that tells little but whether it is near zero: there its slope is one, and beyond twice FINE it hardly changes.
 
     Networks see standardised numbers, and a smooth one cannot tell a touch from a metre of room by a number that goes from 0 to 60 m.
     """
@@ -118,8 +118,10 @@ def taken(points: Float[Array, "points 2"], others: Others) -> Float[Array, "poi
 def near_miss(speed: Float[Array, ""], when: Float[Array, "points"]) -> Float[Array, "2"]:
     """At the point of a route where the car, going on as fast as it does, would miss somebody most narrowly: by how much, and when, in s.
 
-    The first is the time between the car and the first of the others there, whoever comes first (the post-encroachment time of traffic
-    safety, as expected), the second the time until the car is there. Both are SOON where nobody comes near the route, and at most.
+    The one is the time between the car and the earliest of the others there, whichever of the two is earlier (what traffic safety calls
+    post-encroachment time, as expected), the other the time until the car is there. Both are at most SOON, and SOON where nobody comes
+    near. Somebody is told of from the moment on when he is less than SOON away from a point: the numbers jump there. Who comes second to
+    a point is not told of.
     """
     mine = jnp.array(AHEAD) / jnp.maximum(speed, CRAWL)
     between = jnp.where(when < SOON, jnp.minimum(jnp.abs(mine - when), SOON), SOON)
