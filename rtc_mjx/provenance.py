@@ -16,6 +16,7 @@ MEASURING = (
     "evaluate.py",
     "metrics.py",
     "geometry.py",
+    "extrema.py",
     "reference.py",
     "recorded_realism.py",
     "type_shift.py",
