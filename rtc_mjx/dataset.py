@@ -105,7 +105,8 @@ def _made(make: Callable[[jax.Array], Demonstration], count: int, seed: int, at_
 def fingerprint(scene: Scene, count: int, seed: int) -> str:
     """Hash of what determines a set of demonstrations: settings, code, compiled world, versions, precision, count, seed."""
     here = Path(__file__).parent
-    code = [here / name for name in ("dataset.py", "keys.py", "rollout.py", "geometry.py", "extrema.py")] + [Path(inspect.getfile(type(scene)))]
+    code = [here / name for name in ("dataset.py", "keys.py", "rollout.py", "geometry.py", "extrema.py")]
+    code.append(Path(inspect.getfile(type(scene))))
     code += [file for folder in ("scenes", "logs", "physics", "specialise") for file in sorted((here / folder).glob("*.py"))]
     made_by = {"settings": dataclasses.asdict(scene), "world": scene.world.fingerprint, "count": count, "seed": seed}
     return cache.fingerprint(made_by, code)
