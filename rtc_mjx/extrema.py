@@ -7,18 +7,19 @@ both the value and its derivative are read there.
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 
 def largest(x: Float[Array, "..."], axis: int) -> Float[Array, "..."]:
     """The maximum along an axis; of several that are equal the first has the derivative."""
-    return _at(x, jnp.argmax(lax.stop_gradient(x), axis, keepdims=True), axis)
+    return at(x, jnp.argmax(lax.stop_gradient(x), axis, keepdims=True), axis)
 
 
 def least(x: Float[Array, "..."], axis: int) -> Float[Array, "..."]:
     """The minimum along an axis; of several that are equal the first has the derivative."""
-    return _at(x, jnp.argmin(lax.stop_gradient(x), axis, keepdims=True), axis)
+    return at(x, jnp.argmin(lax.stop_gradient(x), axis, keepdims=True), axis)
 
 
-def _at(x: Array, index: Array, axis: int) -> Array:
+def at(x: Float[Array, "..."], index: Int[Array, "..."], axis: int) -> Float[Array, "..."]:
+    """What stands at one place of an axis; `index` keeps the axis, with length 1."""
     return jnp.sum(jnp.where(lax.broadcasted_iota(index.dtype, x.shape, axis % x.ndim) == index, x, 0), axis)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from rtc_mjx.extrema import least
+from rtc_mjx.extrema import at, least
 from rtc_mjx.geometry import capsule_gap, closest_approach, corners, off_road, pose_at, project, rotate, wrapped
 from rtc_mjx.logs import AMBER, GREEN, PEDESTRIAN, RED, VEHICLE, RoadGraph
 from rtc_mjx.physics import PhysicsState
@@ -125,10 +125,9 @@ def near_miss(speed: Float[Array, ""], when: Float[Array, "points"]) -> Float[Ar
     """
     mine = jnp.array(AHEAD) / jnp.maximum(speed, CRAWL)
     between = jnp.where(when < SOON, jnp.minimum(jnp.abs(mine - when), SOON), SOON)
-    margin = least(between, axis=0)
-    here = lax.stop_gradient(jnp.arange(len(AHEAD)) == jnp.argmin(between))
-    at = jnp.minimum(jnp.sum(jnp.where(here, mine, 0.0)), SOON)
-    return jnp.stack([margin, jnp.where(margin < SOON, at, SOON)])
+    narrowest = jnp.argmin(lax.stop_gradient(between), keepdims=True)
+    margin, reached = (at(x, narrowest, axis=0) for x in (between, mine))
+    return jnp.stack([margin, jnp.where(margin < SOON, jnp.minimum(reached, SOON), SOON)])
 
 
 def see_users(others: Others, pose: Float[Array, "3"], own_velocity: Float[Array, "2"]) -> Float[Array, "others 14"]:
