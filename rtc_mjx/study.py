@@ -27,6 +27,7 @@ from rtc_mjx.methods import METHODS, method_name
 from rtc_mjx.runs import Run
 from rtc_mjx.scenes import scene_type
 from rtc_mjx.team import Team
+from rtc_mjx.trained import trained
 
 VARIATIONS: Mapping[str, tuple[str, tuple[Any, ...]]] = {  # option -> method, values beside the committed one
     "encoder-share": ("rtc_c", (0.125, 0.25, 0.5, 0.75)),
@@ -55,7 +56,7 @@ def on_scene(scene: str, options: Sequence[str]) -> list[str]:
 
 
 def whole_or_small(scene: str, methods: Sequence[str], folder: Path, small: Sequence[str]) -> dict[str, Run]:
-    """The finished runs in a folder by method; where one is missing, small ones of all, trained here in a new folder.
+    """The finished runs in a folder by method; where one is missing or is of other code, small ones of all, trained here in a new folder.
 
     Args:
         scene: of the runs.
@@ -63,10 +64,17 @@ def whole_or_small(scene: str, methods: Sequence[str], folder: Path, small: Sequ
         folder: where a study keeps its runs of the scene.
         small: options of the small trainings.
     """
-    if not all((folder / name / "evaluation.json").is_file() for name in methods):
-        folder = Path(tempfile.mkdtemp())
-        return {name: complete(Entry(name, name, tuple(small)), scene, folder / name, analysed=False) for name in methods}
-    return {name: Run.open(folder / name) for name in methods}
+    if all((folder / name / "evaluation.json").is_file() for name in methods):
+        runs = {name: Run.open(folder / name) for name in methods}
+        try:
+            for run in runs.values():
+                trained(run)
+        except UsageError as error:  # such as one whose networks had other inputs
+            Console(stderr=True).print(f"small trainings instead: {error}", markup=False)
+        else:
+            return runs
+    folder = Path(tempfile.mkdtemp())
+    return {name: complete(Entry(name, name, tuple(small)), scene, folder / name, analysed=False) for name in methods}
 
 
 def write(runs: Mapping[str, Run], folder: Path, out: Path, pending: bool = False) -> str:
