@@ -182,7 +182,8 @@ def branch_losses(
 
 
 def critic_loss(learner: Learner, agent: Agent, batch: Demonstration, played: Played, key: Array) -> tuple[Array, dict[str, Array]]:
-    """The discriminator's loss on demonstrations and on the rollouts of all branches, at random times; its accuracies and penalties."""
+    """The discriminator's loss on demonstrations and on rollouts (`LossWeights.fakes`), at random times; its accuracies and penalties."""
+    played = fakes(learner, played)
     steps = learner.scene.steps
     times = random.permutation(key, steps)[: learner.optimiser.discriminator_steps or steps]
     shared, tracks = learner.shared, (learner.by_agent(learner.shared.mine(batch, learner.batch)).trajectory, played.tracks)
@@ -205,10 +206,16 @@ def critic_loss(learner: Learner, agent: Agent, batch: Demonstration, played: Pl
     return loss, report
 
 
+def fakes(learner: Learner, played: Played) -> Played:
+    """The rollouts that the discriminator learns from."""
+    faking = [branch for branch in learner.method.faking(learner.weights.fakes) if learner.size(branch)] or learner.closed_loop
+    kept = np.flatnonzero(learner.of_rollouts([branch in faking for branch in learner.closed_loop]))
+    return played if len(kept) == len(played.alive) else jax.tree.map(lambda x: x[kept], played)
+
+
 def branch_sizes(learner: Learner) -> Int[np.ndarray, "rows"]:
     """For each rollout that this device makes in an update, the number of rollouts that its branch's means are over."""
-    sizes, agents = [learner.size(b) for b in learner.closed_loop], learner.scene.agents
-    return np.repeat([agents * size for size in sizes], [agents * learner.shared.count(size) for size in sizes])
+    return learner.of_rollouts([learner.scene.agents * learner.size(b) for b in learner.closed_loop])
 
 
 def guard(

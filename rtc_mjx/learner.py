@@ -4,9 +4,12 @@ Rows are agents: an episode with several of them is simulated once and makes a r
 """
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import jax
+import numpy as np
 from jax import random
 from jaxtyping import Array
 
@@ -102,7 +105,11 @@ class Learner:
     @property
     def closed_loop(self) -> tuple[Branch, ...]:
         """The branches that are played."""
-        return tuple(b for b in self.method.branches if b.closed_loop)
+        return self.method.closed_loop
+
+    def of_rollouts(self, values: Sequence[Any]) -> np.ndarray:
+        """Of a value for each branch that is played, the one of each rollout that this device makes in an update."""
+        return np.repeat(values, [self.scene.agents * self.shared.count(self.size(b)) for b in self.closed_loop])
 
     def losses(self, branch: Branch) -> tuple[str, ...]:
         """The losses of a branch that the scene has."""

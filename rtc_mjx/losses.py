@@ -20,6 +20,7 @@ from rtc_mjx.pytree import pytree
 from rtc_mjx.trajectory import Demonstration
 
 KlDirection = Literal["posterior_prior", "prior_posterior"]
+Fakes = Literal["all", "test"]
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,8 @@ class LossWeights:
         type_nll: Symphony's label likelihood under its prior.
         discriminator_penalty: R1 gradient penalty of the discriminator, on the expert's pairs.
         discriminator_penalty_agent: R2, that penalty on the agents' pairs; 0 leaves it out.
+        fakes: whose rollouts the discriminator learns from: those of 'all' branches, as in the paper, or of the branch that draws types
+            as at 'test' time; to a method without one, or with one branch, both are the same.
         kl_direction: which KL; 'posterior_prior' is E KL[e||p], 'prior_posterior' the paper's literal E KL[p||e].
     """
 
@@ -60,6 +63,7 @@ class LossWeights:
     type_nll: float = 1.0
     discriminator_penalty: float = 0.1
     discriminator_penalty_agent: float = 0.0
+    fakes: Fakes = "all"
     kl_direction: KlDirection = "posterior_prior"
 
     def total(self, losses: dict[str, Array], update: Array) -> Array:

@@ -10,7 +10,7 @@ from typing import Literal
 
 from rtc_mjx.agent_types import READINGS, Continuous, Discrete, NoType, Pointing, TypeSpace
 from rtc_mjx.errors import UsageError
-from rtc_mjx.losses import CLOSED_LOOP
+from rtc_mjx.losses import CLOSED_LOOP, Fakes
 from rtc_mjx.models import ModelOptions
 
 Share = Literal["all", "encoder_share", "rest"]
@@ -62,6 +62,16 @@ class Method:
         by_loss = {"adversarial": {"discriminator"}, "policy_gradient": {"discriminator", "value"}}
         used = [by_source.get(b.types, set()) for b in self.branches] + [by_loss.get(x, set()) for b in self.branches for x in b.losses]
         return frozenset().union(*used)
+
+    @property
+    def closed_loop(self) -> tuple[Branch, ...]:
+        """The branches that are played."""
+        return tuple(branch for branch in self.branches if branch.closed_loop)
+
+    def faking(self, fakes: Fakes) -> tuple[Branch, ...]:
+        """The branches whose rollouts the discriminator learns from."""
+        as_tested = tuple(branch for branch in self.closed_loop if branch.types == self.test_types)
+        return as_tested if fakes == "test" and as_tested else self.closed_loop
 
     @property
     def encodes(self) -> bool:

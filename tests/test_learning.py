@@ -14,6 +14,7 @@ from learning import CLOSED_LOOP, ON_SCENE, SCENE, SCORED, begin, experts, learn
 
 from rtc_mjx import gradients as learning
 from rtc_mjx.agent_types import SOURCES
+from rtc_mjx.config import unread
 from rtc_mjx.gradients import Played, gradients
 from rtc_mjx.losses import LOSSES, Case, LossWeights
 from rtc_mjx.methods import METHODS
@@ -116,6 +117,26 @@ def test_rollouts_of_both_branches_are_fakes_for_the_discriminator(method):
     )
     both = learning.critic_loss(held, agent, batch, played, random.key(3))[0]
     assert both == pytest.approx(float(first + second) / 2, rel=1e-5) and abs(float(first - second)) > 1e-6
+
+
+@pytest.mark.parametrize("method", CLOSED_LOOP)
+def test_discriminator_learns_from_types_as_at_test_time_where_told_so(method):
+    """RTC's prior branch alone is fakes then; for whoever plays one branch, or has no minibatch left for the other, nothing changes."""
+    for share in (0.25, 1.0):
+        held = learner(method, share=share)
+        state, batch = begin(held)
+        agent = held.agent(state.networks)
+        played, _ = learning.play_together(held, agent, batch, learning.infer(held, agent, batch, random.key(1)), random.key(2))
+
+        def loss(fakes, kept, held=held, agent=agent, batch=batch, played=played):
+            told = dataclasses.replace(held, weights=dataclasses.replace(held.weights, fakes=fakes))
+            return float(learning.critic_loss(told, agent, batch, Played(played.tracks, played.alive & kept), random.key(3))[0])
+
+        everybody = jnp.ones(held.batch, bool)
+        as_tested = jnp.arange(held.batch) >= (3 if method.startswith("rtc") and share < 1 else 0)
+        assert loss("test", everybody) == pytest.approx(loss("all", as_tested), rel=1e-6)
+        assert (loss("test", everybody) != pytest.approx(loss("all", everybody), rel=1e-6)) == (not bool(jnp.all(as_tested)))
+        assert ("losses.fakes" in unread(method)) == (not method.startswith("rtc"))
 
 
 def test_discriminator_is_kept_smooth_where_experts_are_and_where_agents_are(x64):

@@ -519,7 +519,7 @@ def test_a_run_may_lack_later_settings_that_its_method_does_not_read(method, tmp
     held = settings(method)
     config.write(held, tmp_path)
     table = json.loads((tmp_path / "config.json").read_text())
-    for name in (*config.OF_VALUE, "model.posterior_components", "losses.discriminator_penalty_agent"):
+    for name in (*config.OF_VALUE, "model.posterior_components", "losses.discriminator_penalty_agent", "losses.fakes"):
         section, key = name.split(".")
         del table[section][key]
     (tmp_path / "config.json").write_text(json.dumps(table))

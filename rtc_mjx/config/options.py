@@ -141,9 +141,11 @@ def differing(ours: Config, theirs: Config) -> list[tuple[str, Any, Any]]:
 
 def unread(method: str) -> frozenset[str]:
     """Settings that a method does not read: two runs of it that differ in these are alike."""
-    return frozenset() if "value" in METHODS[method_name(method)].parts else frozenset(OF_VALUE)
+    held = METHODS[method_name(method)]
+    one_for_all = held.faking("test") == held.closed_loop
+    return frozenset(() if "value" in held.parts else OF_VALUE) | frozenset(["losses.fakes"] if one_for_all else ())
 
 
 def later(method: str) -> frozenset[str]:
     """Settings that a run may lack since they came later: those its method does not read, and those whose default is what was before."""
-    return unread(method) | {"model.posterior_components", "losses.discriminator_penalty_agent"}
+    return unread(method) | {"model.posterior_components", "losses.discriminator_penalty_agent", "losses.fakes"}
