@@ -96,7 +96,7 @@ class Driving(Scene):
     route_options: ClassVar[RouteOptions] = RouteOptions()
     samples: ClassVar[int] = SAMPLES
     reconstructs_rollouts: ClassVar[bool] = True
-    described_by: ClassVar[tuple[str, ...]] = ("collision", "offroad", "progress", "curvature", "decided", "ran_red")
+    described_by: ClassVar[tuple[str, ...]] = ("collision", "offroad", "progress", "curvature", "turned", "decided", "ran_red")
     mark_size: ClassVar[float] = 0.3
     least_view: ClassVar[float] = 20.0
     side_by_side: ClassVar[bool] = True
