@@ -97,7 +97,7 @@ def infer(learner: Learner, agent: Agent, batch: Demonstration, key: Array) -> l
 
 def joined_types(learner: Learner, typed: list[Typed]) -> Float[Array, "rows size"]:
     """Types of all rollouts of an update, branch after branch."""
-    return jnp.concatenate([t.agent_type for b, t in zip(learner.method.branches, typed, strict=True) if b.closed_loop])
+    return jnp.concatenate([t.agent_type for b, t in zip(learner.method.branches, typed, strict=True) if b in learner.closed_loop])
 
 
 @pytree
@@ -170,7 +170,7 @@ def branch_losses(
         mine = learner.part(branch, batch)
         count = len(types.agent_type)
         part = Played(None, jnp.ones(count, bool))
-        if branch.closed_loop:
+        if branch in learner.closed_loop:
             part = jax.tree.map(lambda x, a=first, n=count: x[a : a + n], played)
             first += count
         cases = Case(mine, types, part.tracks, learner.keys(key, learner.size(branch)), part.credit)
@@ -208,8 +208,7 @@ def critic_loss(learner: Learner, agent: Agent, batch: Demonstration, played: Pl
 
 def fakes(learner: Learner, played: Played) -> Played:
     """The rollouts that the discriminator learns from."""
-    faking = [branch for branch in learner.method.faking(learner.weights.fakes) if learner.size(branch)] or learner.closed_loop
-    kept = np.flatnonzero(learner.of_rollouts([branch in faking for branch in learner.closed_loop]))
+    kept = np.flatnonzero(learner.of_rollouts([branch in learner.faking for branch in learner.closed_loop]))
     return played if len(kept) == len(played.alive) else jax.tree.map(lambda x: x[kept], played)
 
 

@@ -14,7 +14,7 @@ from jax import random
 from jaxtyping import Array
 
 from rtc_mjx.agent_types import SOURCES, Typed, TypeSpace
-from rtc_mjx.losses import PATHWISE, LossWeights
+from rtc_mjx.losses import CLOSED_LOOP, PATHWISE, LossWeights
 from rtc_mjx.methods import Branch, Method
 from rtc_mjx.models import Agent, ModelOptions, Networks, Statistics
 from rtc_mjx.physics import OneStep
@@ -105,15 +105,21 @@ class Learner:
     @property
     def closed_loop(self) -> tuple[Branch, ...]:
         """The branches that are played."""
-        return self.method.closed_loop
+        return tuple(b for b in self.method.branches if CLOSED_LOOP & set(self.losses(b)))
+
+    @property
+    def faking(self) -> tuple[Branch, ...]:
+        """The branches that L_adv and the discriminator read; all that are played, where the minibatch leaves nothing for those."""
+        return tuple(b for b in self.method.faking(self.weights.fakes) if self.size(b)) or self.method.closed_loop
 
     def of_rollouts(self, values: Sequence[Any]) -> np.ndarray:
         """Of a value for each branch that is played, the one of each rollout that this device makes in an update."""
         return np.repeat(values, [self.scene.agents * self.shared.count(self.size(b)) for b in self.closed_loop])
 
     def losses(self, branch: Branch) -> tuple[str, ...]:
-        """The losses of a branch that the scene has."""
-        return tuple(name for name in branch.losses if name != "reconstruction" or self.scene.reconstructs_rollouts)
+        """The losses of a branch: those that the scene has, and L_adv where its rollouts are fakes."""
+        has = {"reconstruction": self.scene.reconstructs_rollouts, "adversarial": branch in self.faking}
+        return tuple(name for name in branch.losses if has.get(name, True))
 
     @property
     def pathwise(self) -> bool:

@@ -43,8 +43,8 @@ class LossWeights:
         type_nll: Symphony's label likelihood under its prior.
         discriminator_penalty: R1 gradient penalty of the discriminator, on the expert's pairs.
         discriminator_penalty_agent: R2, that penalty on the agents' pairs; 0 leaves it out.
-        fakes: whose rollouts the discriminator learns from: those of 'all' branches, as in the paper, or of the branch that draws types
-            as at 'test' time; to a method without one, or with one branch, both are the same.
+        fakes: the rollouts that L_adv is of and the discriminator learns from: those of 'all' branches, as in the paper, or of the branch
+            that draws types as at 'test' time; to a method without one, or with one branch, both are the same.
         kl_direction: which KL; 'posterior_prior' is E KL[e||p], 'prior_posterior' the paper's literal E KL[p||e].
     """
 

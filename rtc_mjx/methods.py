@@ -65,11 +65,11 @@ class Method:
 
     @property
     def closed_loop(self) -> tuple[Branch, ...]:
-        """The branches that are played."""
+        """The branches that have a loss on rollouts."""
         return tuple(branch for branch in self.branches if branch.closed_loop)
 
     def faking(self, fakes: Fakes) -> tuple[Branch, ...]:
-        """The branches whose rollouts the discriminator learns from."""
+        """The branches whose rollouts L_adv is of and the discriminator learns from (`losses.LossWeights.fakes`)."""
         as_tested = tuple(branch for branch in self.closed_loop if branch.types == self.test_types)
         return as_tested if fakes == "test" and as_tested else self.closed_loop
 

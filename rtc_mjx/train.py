@@ -191,8 +191,7 @@ class Tests:
 
 def env_steps(learner: Learner, update: int) -> int:
     """Control steps simulated by one seed in so many updates."""
-    rows = [learner.rows(b) for b in learner.method.branches if b.closed_loop]
-    return update * learner.scene.steps * sum(r.stop - r.start for r in rows)
+    return update * learner.scene.steps * sum(learner.size(b) for b in learner.closed_loop)
 
 
 def as_lists(seen: dict[str, jax.Array]) -> dict[str, list[float]]:

@@ -21,7 +21,7 @@ from rtc_mjx.methods import METHODS
 from rtc_mjx.models import Networks
 from rtc_mjx.networks import Encoder, Layout, Reader, Scores
 from rtc_mjx.rollout import rollout
-from rtc_mjx.scenes import ItemSet
+from rtc_mjx.scenes import DoubleGoal, ItemSet
 from rtc_mjx.updates import train_step
 
 NOTHING = LossWeights(**{f.name: 0.0 for f in dataclasses.fields(LossWeights) if isinstance(f.default, float)}, adversarial_ramp=0)
@@ -49,7 +49,7 @@ def plain_loss(held, networks, batch, key):
 
 def plain_rollouts(held, agent, batch, typed, key):
     """As `play_together` numbers and draws them."""
-    rows = [np.arange(held.batch)[held.rows(b)] for b in held.method.branches if b.closed_loop]
+    rows = [np.arange(held.batch)[held.rows(b)] for b in held.closed_loop]
     if not rows:
         return None
     episodes, g = jax.tree.map(lambda x: x[np.concatenate(rows)], batch.episode), learning.joined_types(held, typed)
@@ -119,24 +119,53 @@ def test_rollouts_of_both_branches_are_fakes_for_the_discriminator(method):
     assert both == pytest.approx(float(first + second) / 2, rel=1e-5) and abs(float(first - second)) > 1e-6
 
 
+class Reconstructing(DoubleGoal):
+    """Plays the encoder's branch for L_rec, as driving does."""
+
+    reconstructs_rollouts = True
+
+    def discrepancy(self, demonstration, trajectory):
+        return jnp.mean((demonstration.trajectory.states.qpos - trajectory.states.qpos) ** 2)
+
+
+@pytest.mark.parametrize("scene", [SCENE, Reconstructing(steps=SCENE.steps)], ids=["actions", "rollouts"])
 @pytest.mark.parametrize("method", CLOSED_LOOP)
-def test_discriminator_learns_from_types_as_at_test_time_where_told_so(method):
-    """RTC's prior branch alone is fakes then; for whoever plays one branch, or has no minibatch left for the other, nothing changes."""
-    for share in (0.25, 1.0):
-        held = learner(method, share=share)
-        state, batch = begin(held)
-        agent = held.agent(state.networks)
-        played, _ = learning.play_together(held, agent, batch, learning.infer(held, agent, batch, random.key(1)), random.key(2))
+def test_only_rollouts_under_types_as_at_test_time_are_fakes_where_told_so(method, scene):
+    """Of RTC, its prior branch: neither L_adv nor the discriminator reads the other one, which is played for L_rec alone."""
+    told = learner(method, weights=LossWeights(adversarial_ramp=0, fakes="test"), share=0.25)
+    held = dataclasses.replace(told, scene=scene, weights=dataclasses.replace(told.weights, fakes="all"))
+    told = dataclasses.replace(told, scene=scene)
+    state, batch = begin(told)
+    agent = told.agent(state.networks)
+    typed = learning.infer(told, agent, batch, random.key(1))
+    played, _ = learning.play_together(held, agent, batch, typed, random.key(2))
+    rtc, split = method.startswith("rtc"), 3
+    assert (told.faking != held.faking) == rtc == ("losses.fakes" not in unread(method))
+    if not rtc:
+        assert told.closed_loop == held.closed_loop and [told.losses(b) for b in told.closed_loop] == [
+            held.losses(b) for b in held.closed_loop
+        ]
+        return
+    fakes = Played(jax.tree.map(lambda x: x[split:], played.tracks), played.alive[split:])
+    masked = Played(played.tracks, played.alive & (jnp.arange(told.batch) >= split))
+    mine = played if scene.reconstructs_rollouts else fakes
+    (ours, _), (theirs, _) = (learning.critic_loss(x, agent, batch, y, random.key(3)) for x, y in ((told, mine), (held, masked)))
+    assert float(ours) == pytest.approx(float(theirs), rel=1e-6)
+    lost = learning.branch_losses(told, agent, batch, typed, mine, random.key(4), frozenset(LOSSES))
+    plain = jax.vmap(lambda case: LOSSES["adversarial"](agent, case, told.weights))(Case(None, None, fakes.tracks, None))
+    assert float(lost["adversarial"]) == pytest.approx(float(jnp.mean(plain)), rel=1e-6)
+    assert ("reconstruction" in lost) == scene.reconstructs_rollouts
+    alone = dataclasses.replace(told, weights=dataclasses.replace(only(adversarial=1.0), fakes="test"))
+    gradient, _ = gradients(alone, state.networks, batch, random.key(0), jnp.array(0))
+    assert size(gradient.encoder) == 0 and size(gradient.policy) > 0  # types that only L_rec and L_kl shape
+    assert sum(told.size(b) for b in told.closed_loop) == told.batch - (0 if scene.reconstructs_rollouts else split)
 
-        def loss(fakes, kept, held=held, agent=agent, batch=batch, played=played):
-            told = dataclasses.replace(held, weights=dataclasses.replace(held.weights, fakes=fakes))
-            return float(learning.critic_loss(told, agent, batch, Played(played.tracks, played.alive & kept), random.key(3))[0])
 
-        everybody = jnp.ones(held.batch, bool)
-        as_tested = jnp.arange(held.batch) >= (3 if method.startswith("rtc") and share < 1 else 0)
-        assert loss("test", everybody) == pytest.approx(loss("all", as_tested), rel=1e-6)
-        assert (loss("test", everybody) != pytest.approx(loss("all", everybody), rel=1e-6)) == (not bool(jnp.all(as_tested)))
-        assert ("losses.fakes" in unread(method)) == (not method.startswith("rtc"))
+@pytest.mark.parametrize("kind", "cd")
+def test_rtc_with_all_of_the_minibatch_encoded_is_naive_hierarchy_whatever_are_fakes(kind):
+    weights = LossWeights(adversarial_ramp=0, fakes="test")
+    naive, rtc = learner(f"naive_hierarchy_{kind}", weights=weights), learner(f"rtc_{kind}", weights=weights, share=1.0)
+    assert rtc.faking == rtc.method.closed_loop and [rtc.losses(rtc.method.branches[0])] == [naive.losses(b) for b in naive.method.branches]
 
 
 def test_discriminator_is_kept_smooth_where_experts_are_and_where_agents_are(x64):

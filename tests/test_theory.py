@@ -306,6 +306,20 @@ def test_lambda_alone_moves_the_change_of_sides_to_a_larger_beta():
     assert np.max(without.luck[1]) < 0.05 and np.max(with_it.luck[1]) < 0.05
 
 
+def test_rtc_finds_solution_1_by_a_strong_adversarial_loss_where_only_the_priors_rollouts_are_fakes():
+    """With both branches as fakes types keep luck, and agents err under the prior twice as often as they must (epsilon)."""
+    settings = learning.grid((0.05,), (0.1,), (3.0,))
+    both, prior_alone = (learning.sweep(solutions.crossing(), "rtc_d", settings, 8, 2000, fakes).measures for fakes in ("all", "test"))
+    assert np.mean(both.luck) > 0.3 and np.mean(both.error_prior) > 0.08
+    assert np.max(prior_alone.luck) < 0.05 and np.max(prior_alone.error_prior) < 0.06 and np.min(prior_alone.mind) > 0.95
+
+
+def test_naive_hierarchy_knows_no_difference_between_fakes():
+    settings = learning.grid((0.05,), (0.1,), (1.0,))
+    both, prior_alone = (learning.sweep(solutions.crossing(), "naive_hierarchy_d", settings, 2, 50, fakes) for fakes in ("all", "test"))
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(both), jax.tree.leaves(prior_alone), strict=True))
+
+
 def test_ends_are_counted_by_hand():
     found = learning.ends(np.array([0.0, 0.05, 0.31, 0.95]))
     assert found == {"solution 1": 0.5, "solution 2": 0.25, "in between": 0.25}
@@ -340,6 +354,7 @@ def test_the_command_prints_tables_and_writes_figure_and_json(tmp_path, capsys, 
     assert broken["residual"] == pytest.approx(0) and np.allclose(np.sum(broken["tables"]["test_actions"], axis=0), [0.45, 0.05, 0.5])
     assert held["theorem"]["census"]["deterministic"]["instances"] <= 50
     assert np.shape(held["learned"]["rtc_d"]["measures"]["luck"]) == (6, 2)
+    assert held["rtc_d_by_fakes"]["all"] == held["learned"]["rtc_d"] != held["rtc_d_by_fakes"]["test"]
 
 
 @pytest.mark.parametrize(

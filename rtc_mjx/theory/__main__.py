@@ -11,6 +11,7 @@ from pathlib import Path
 from rtc_mjx import cache, cli
 from rtc_mjx.errors import UsageError
 from rtc_mjx.files import write_whole
+from rtc_mjx.losses import Fakes
 from rtc_mjx.theory import drawing, learning, printing, solutions, theorem
 
 DRAWN = 0.05  # the epsilon of the figure
@@ -56,8 +57,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     console.print(printing.examples_table(examples))
     results = {name: learning.sweep(expert, name, settings, options.seeds, options.updates) for name in printing.NAMES}
     console.print(printing.learned_table(expert, results))
+    prior_alone = learning.sweep(expert, "rtc_d", settings, options.seeds, options.updates, "test")
+    by_fakes: dict[Fakes, learning.Learned] = {"all": results["rtc_d"], "test": prior_alone}
+    console.print(printing.fakes_table(expert, by_fakes))
     if options.json:
-        write_whole(options.json, json.dumps(printing.as_json(expert, rows, counts, examples, results), indent=1) + "\n")
+        write_whole(options.json, json.dumps(printing.as_json(expert, rows, counts, examples, results, by_fakes), indent=1) + "\n")
     if options.figure:
         drawing.everything(options.figure, expert, found[DRAWN_HYPOTHESIS], results, DRAWN)
 

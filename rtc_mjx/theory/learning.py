@@ -3,10 +3,10 @@
 The branches are those of `rtc_mjx.methods`, the losses those of `rtc_mjx.losses`, with every expectation summed out: no sampling, so what
 an agent ends at says something about the objective and the descent, not about noise. L_rec is cloning, as on the double goal.
 
-The discriminator is the best there is for the present agent, D = p / (p + q) with q the mixture of what all branches play, and is held
-fixed while the agent learns. That is what alternating training tends to when D keeps up, and what `losses.adversarial` does. The exact
-divergence could be descended instead, but it is another objective: with D fixed, the gradient of E_q[-log D] is that of
-KL[q||p] - 2 JSD[q||p] (Arjovsky and Bottou, 2017, theorem 2.5), which is what a library with this loss follows.
+The discriminator is the best there is for the present agent, D = p / (p + q) with q the mixture of what the branches play whose rollouts
+are fakes, and is held fixed while the agent learns. That is what alternating training tends to when D keeps up, and what
+`losses.adversarial` does. The exact divergence could be descended instead, but it is another objective: with D fixed, the gradient of
+E_q[-log D] is that of KL[q||p] - 2 JSD[q||p] (Arjovsky and Bottou, 2017, theorem 2.5), which is what a library with this loss follows.
 """
 
 import functools
@@ -20,6 +20,7 @@ from jax import lax, random
 from jaxtyping import Array, Float, Int
 
 from rtc_mjx.errors import UsageError
+from rtc_mjx.losses import Fakes
 from rtc_mjx.methods import METHODS, Branch, Method
 from rtc_mjx.pytree import pytree
 from rtc_mjx.theory import solutions, tables
@@ -99,28 +100,30 @@ def share(branch: Branch) -> float:
     return {"all": 1.0, "encoder_share": ENCODER_SHARE, "rest": 1 - ENCODER_SHARE}[branch.share]
 
 
-def objective(logits: Logits, expert: Expert, method: Method, setting: Setting) -> Float[Array, ""]:
-    """L_rec + beta L_kl + lambda L_adv, summed over the method's branches (paper, eq. 3), in nats."""
+def objective(logits: Logits, expert: Expert, method: Method, setting: Setting, fakes: Fakes = "all") -> Float[Array, ""]:
+    """L_rec + beta L_kl + lambda L_adv, summed over the method's branches (paper, eq. 3), in nats; `fakes` as in `losses.LossWeights`."""
     agent = logits.agent(setting.epsilon)
     plays = [played(branch, expert, agent) for branch in method.branches]
-    fakes = jnp.sum(jnp.stack([share(b) * play for b, play in zip(method.branches, plays, strict=True)]), axis=0)
-    fixed = logit(expert, fakes)
+    faking = method.faking(fakes)
+    weights = [share(b) * (b in faking) for b in method.branches]
+    mixture = sum((weight * play for weight, play in zip(weights, plays, strict=True)), jnp.zeros(())) / sum(weights)
+    fixed = logit(expert, mixture)
     shared = {"cloning": solutions.reconstruction(expert, agent), "type_kl": setting.type_kl * solutions.type_kl(expert, agent)}
     total = jnp.zeros(())
     for branch, play in zip(method.branches, plays, strict=True):
         values = shared | {"adversarial": setting.adversarial * jnp.sum(play * jax.nn.softplus(-fixed))}
-        total += sum(values[name] for name in branch.losses if name in values)
+        total += sum(values[name] for name in branch.losses if name in values and (name != "adversarial" or branch in faking))
     return total
 
 
-def learned(expert: Expert, method: Method, setting: Setting, seed: Int[Array, ""], updates: int) -> TypedAgent:
+def learned(expert: Expert, method: Method, setting: Setting, seed: Int[Array, ""], updates: int, fakes: Fakes = "all") -> TypedAgent:
     """The agent after `updates` steps of Adam on the exact objective."""
     optimiser = optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, updates))
     first = start(seed, expert)
 
     def step(held: tuple[Logits, optax.OptState], _: None) -> tuple[tuple[Logits, optax.OptState], None]:
         logits, moments = held
-        change, moments = optimiser.update(jax.grad(objective)(logits, expert, method, setting), moments)
+        change, moments = optimiser.update(jax.grad(objective)(logits, expert, method, setting, fakes), moments)
         return (optax.apply_updates(logits, change), moments), None
 
     (last, _), _ = lax.scan(step, (first, optimiser.init(first)), length=updates)
@@ -163,12 +166,12 @@ def ends(luck: Float[np.ndarray, "seeds"]) -> dict[str, float]:
     return {"solution 1": first, "solution 2": second, "in between": 1 - first - second}
 
 
-@functools.partial(jax.jit, static_argnames=("method", "seeds", "updates"))
-def sweep(expert: Expert, method: str, settings: Setting, seeds: int, updates: int) -> Learned:
+@functools.partial(jax.jit, static_argnames=("method", "seeds", "updates", "fakes"))
+def sweep(expert: Expert, method: str, settings: Setting, seeds: int, updates: int, fakes: Fakes = "all") -> Learned:
     """What a method learns at every setting from every seed."""
 
     def one(setting: Setting, seed: Array) -> Measures:
-        return solutions.measures(expert, learned(expert, METHODS[method], setting, seed, updates))
+        return solutions.measures(expert, learned(expert, METHODS[method], setting, seed, updates, fakes))
 
     over_seeds = jax.vmap(one, in_axes=(None, 0))
     return Learned(settings, jax.vmap(over_seeds, in_axes=(0, None))(settings, jnp.arange(seeds)))

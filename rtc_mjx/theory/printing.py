@@ -6,6 +6,7 @@ import jax
 import numpy as np
 from rich.table import Table
 
+from rtc_mjx.losses import Fakes
 from rtc_mjx.theory import learning, solutions, theorem
 from rtc_mjx.theory.learning import Learned
 from rtc_mjx.theory.solutions import Measures
@@ -77,18 +78,32 @@ def learned_table(expert: Expert, results: dict[str, Learned]) -> Table:
     """Where agents end (`learning.ends`), and their error under the prior, mean over seeds."""
     both = ((method, weight) for method in results for weight in learning.ADVERSARIALS)
     shown = [(method, weight) for method, weight in both if method != "rtc_d" or weight > 0]  # without L_adv RTC is naive
-    heads = ("β", "", *(f"{NAMES[m]}\nλ = {x:g}" for m, x in shown))
     title = "Learned: % of seeds at solution 1 / in between / at solution 2, and mean error under the prior"
-    table = _table(title, "ε", heads)
+    table = _ends_table(title, expert, {f"{NAMES[m]}\nλ = {x:g}": (results[m], x) for m, x in shown})
+    luck = f"At solution 1: I(G;S) / I(S;A) below {learning.NEAR:g}; at solution 2: above {1 - learning.NEAR:g}."
+    table.caption = f"{luck} Naive: L_rec + β L_kl + λ L_adv under paired types alone."
+    return table
+
+
+def fakes_table(expert: Expert, results: dict[Fakes, Learned]) -> Table:
+    """The same of RTC, whose L_adv and discriminator read both branches or the prior's alone (`losses.LossWeights.fakes`)."""
+    both = ((fakes, weight) for weight in learning.ADVERSARIALS if weight > 0 for fakes in results)
+    title = "RTC, by the branches whose rollouts are fakes: ends as above, and mean error under the prior"
+    table = _ends_table(title, expert, {f"{fakes}\nλ = {x:g}": (results[fakes], x) for fakes, x in both})
+    table.caption = "Both branches as fakes: what paired types do too often may make up for what the prior's do too rarely."
+    return table
+
+
+def _ends_table(title: str, expert: Expert, shown: dict[str, tuple[Learned, float]]) -> Table:
+    """By epsilon and beta; a column, by its head, is what one lambda leads to."""
+    table = _table(title, "ε", ("β", "", *shown))
     for epsilon in learning.EPSILONS:
-        parts = [results[m].along_type_kl(epsilon, x).measures for m, x in shown]
+        parts = [held.along_type_kl(epsilon, weight).measures for held, weight in shown.values()]
         turn = float(solutions.boundary(expert, epsilon))
         for index, beta in enumerate(learning.TYPE_KLS):
             cells = (f"{_ends(np.asarray(p.luck[index]))}  {float(np.mean(p.error_prior[index])):.3f}" for p in parts)
             last = beta == learning.TYPE_KLS[-1]
             table.add_row(f"{epsilon:g}", f"{beta:g}", "< β*" if beta < turn else "", *cells, end_section=last)
-    luck = f"At solution 1: I(G;S) / I(S;A) below {learning.NEAR:g}; at solution 2: above {1 - learning.NEAR:g}."
-    table.caption = f"{luck} Naive: L_rec + β L_kl + λ L_adv under paired types alone."
     return table
 
 
@@ -111,6 +126,7 @@ def as_json(
     counts: dict[str, dict[str, int]],
     two: dict[str, Comparison],
     results: dict[str, Learned],
+    by_fakes: dict[Fakes, Learned],
 ) -> dict[str, Any]:
     """Everything that was found; comparisons in nats, measures in the units that `solutions.Measures` says.
 
@@ -120,13 +136,17 @@ def as_json(
     def solution(epsilon: float, name: str) -> dict[str, Any]:
         return jax.tree.map(_listed, solutions.shown(expert, solutions.SOLUTIONS[name](expert, epsilon)))
 
+    def swept(held: Learned) -> dict[str, Any]:
+        return {"settings": _plain(held.settings), "measures": _plain(held.measures)}
+
     examples = {
         name: {**_plain(c), "tables": jax.tree.map(_listed, theorem.example_tables(theorem.EXAMPLES[name]))} for name, c in two.items()
     }
     return {
         "solutions": [{"epsilon": e, "solution": name, **_plain(row), "tables": solution(e, name)} for (e, name), row in rows.items()],
         "theorem": {"census": counts, "examples": examples},
-        "learned": {m: {"settings": _plain(r.settings), "measures": _plain(r.measures)} for m, r in results.items()},
+        "learned": {name: swept(held) for name, held in results.items()},
+        "rtc_d_by_fakes": {name: swept(held) for name, held in by_fakes.items()},
     }
 
 
