@@ -36,6 +36,7 @@ VARIATIONS: Mapping[str, tuple[str, tuple[Any, ...]]] = {  # option -> method, v
     "model.type-size": ("rtc_c", (1, 2, 4, 16)),
     "model.type-count": ("rtc_d", (2, 4, 16, 32)),
     "losses.kl-direction": ("rtc_c", ("prior_posterior",)),
+    "losses.fakes": ("rtc_c", ("all", "test")),
     "optimiser.gradient": ("rtc_c", ("dynamics_only", "none")),
 }
 
