@@ -330,7 +330,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     batches = [64] if options.quick else _batches(options.batches)
     cli.check_outs(json=options.json, figure=options.figure)
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are measured
-    if options.scaling_on:
+    if options.scaling_on is not None:
+        cli.at_least(1, **{"scaling-on": options.scaling_on})
         sys.stdout.write(json.dumps(scaling.measure_here(options.scene, options.scaling_on, options.rounds)) + "\n")
         return
     rounds = 3 if options.quick else options.rounds

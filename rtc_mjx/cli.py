@@ -4,7 +4,7 @@ import argparse
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from rich.console import Console
 
@@ -14,7 +14,10 @@ WIDTH = 160  # characters of a line of a table
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line."""
+    """An argument parser whose errors are one line, and whose options are written out."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **{"allow_abbrev": False} | kwargs)
 
     def error(self, message: str) -> NoReturn:
         """Prints the message and leaves with status 2."""
@@ -47,9 +50,9 @@ def check_out(file: Path, ending: str, option: str = "--out") -> None:
     """Checks a file that is to be written.
 
     Raises:
-        UsageError: its name ends otherwise, or its folder does not exist.
+        UsageError: its name ends otherwise, its folder does not exist, or it is a folder itself.
     """
-    if file.suffix != ending or not file.absolute().parent.is_dir():
+    if not file.name or file.suffix != ending or file.is_dir() or not file.absolute().parent.is_dir():
         told = f" that ends in {ending}" if ending else ""
         raise UsageError(f"{option} {file}: a file name{told}, in a folder that exists, is needed")
 

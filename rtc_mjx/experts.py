@@ -27,7 +27,7 @@ def told(settings: Config) -> tuple[dict[str, tuple[float, float, float, float]]
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Prints a table."""
-    parser = cli.Parser(prog=COMMAND, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
+    parser = cli.Parser(prog=COMMAND, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", required=True, metavar="NAME", help="the scene")
     parser.add_argument("--episodes", type=int, default=512, metavar="N", help="test episodes (default %(default)s)")
     options, rest = parser.parse_known_args(argv)

@@ -49,9 +49,11 @@ class Run:
         """Makes the directory; its settings are written last, so that a directory with settings is whole.
 
         Raises:
-            UsageError: it exists, and holds more than what was left of making it; nothing is ever overwritten.
+            UsageError: it exists, and holds more than what was left of making it, or is a file; nothing is ever overwritten.
         """
         folder = config.folder
+        if folder.is_file():
+            raise UsageError(f"--run {folder} is a file; a directory is needed")
         if folder.exists() and not unbegun(folder):
             raise UsageError(f"--run {folder} exists: go on with --resume, or name another")
         try:

@@ -140,7 +140,7 @@ def collected(wanted: Sequence[Entry], scene: str, folder: Path) -> dict[str, Ru
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs or goes on with a study."""
-    parser = cli.Parser(prog=COMMAND, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
+    parser = cli.Parser(prog=COMMAND, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", required=True, metavar="NAME", help="the scene")
     parser.add_argument("--methods", metavar="A,B", help="methods, separated by commas (default: all that run on the scene)")
     parser.add_argument("--seeds", type=int, default=20, metavar="N", help="seeds of each entry; those there are kept (default: 20)")
@@ -153,7 +153,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         rest, COMMAND, method="name methods with --methods A,B", run="--runs DIR is where runs are kept", resume="a study goes on by itself"
     )
     scene_type(options.scene)
-    chosen = [method_name(name) for name in options.methods.split(",")] if options.methods else on_scene(options.scene, rest)
+    chosen = [method_name(name.strip()) for name in options.methods.split(",")] if options.methods else on_scene(options.scene, rest)
     if options.ablations:  # what variations are compared with
         chosen += [method for method in dict.fromkeys(method for method, _ in VARIATIONS.values()) if method not in chosen]
     cache.keep_compiled()

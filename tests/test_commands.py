@@ -70,6 +70,9 @@ def test_hand_written_equations_do_what_the_world_does(name):
         (["--batches", "0"], "--batches 0"),
         (["--rounds", "0"], "--rounds 0"),
         (["--json", "/nowhere/at/all.json"], "--json /nowhere/at"),
+        (["--json", "/"], "--json /: a file name"),
+        (["--json", ""], "a file name"),
+        (["--scaling-on", "0"], "--scaling-on 0: at least 1"),
         (["--figure", "speed.foo"], "--figure speed.foo: a file name that ends in .png"),
     ],
 )
@@ -79,7 +82,7 @@ def test_wrong_options_are_refused_in_one_line(options, named):
 
 
 def test_wrong_use_leaves_with_status_2_and_one_line():
-    for options in (["--worlds", "moon"], ["--quik"]):
+    for options in (["--worlds", "moon"], ["--quik"], ["--quic"]):  # nothing is guessed from the beginning of an option
         done = subprocess.run([sys.executable, "-m", "rtc_mjx.benchmark", *options], capture_output=True, text=True, cwd=ROOT, check=False)
         assert done.returncode == 2
         assert len(done.stderr.strip().splitlines()) == 1

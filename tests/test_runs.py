@@ -505,6 +505,13 @@ def test_exit_statuses(tmp_path):
     assert "expert" in done.stdout and jax.tree.leaves(json.loads((tmp_path / "r" / "evaluation.json").read_text()))
 
 
+def test_a_run_that_is_a_file_is_refused(tmp_path):
+    (tmp_path / "r").write_text("mine")
+    with pytest.raises(UsageError, match="is a file"):
+        Run.create(settings("bc", tmp_path / "r"))
+    assert (tmp_path / "r").read_text() == "mine"
+
+
 def test_settings_that_lack_a_key_are_not_completed_with_todays_defaults(tmp_path):
     config.write(settings("bc"), tmp_path)
     table = json.loads((tmp_path / "config.json").read_text())
