@@ -37,7 +37,8 @@ class OptimiserOptions:
         final_rate: share of the learning rate left at the last update.
         clip: largest norm of an update's gradient: of policy and encoder, of the prior, of discriminator and Q, of V.
         trajectory_clip: largest norm of the gradient of one trajectory's own loss by the policy's outputs.
-        gradient: what flows back from step to step of a rollout.
+        gradient: what flows back from step to step of a rollout: everything ('full'), all but how the policy reacts to what it sees
+            ('dynamics_only'), or nothing ('none').
         decay: shrinks the backward signal at each step back in time.
         discount: of GAIL's rewards, a step.
         trace: lambda of GAIL's advantage estimation: 0 trusts V after one step, 1 only looks at rewards.

@@ -140,7 +140,8 @@ def collected(wanted: Sequence[Entry], scene: str, folder: Path) -> dict[str, Ru
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Runs or goes on with a study."""
-    parser = cli.Parser(prog=COMMAND, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    more = "Every other option is one of `python -m rtc_mjx.train` (--first-seed, --updates, --losses. ...) and goes to each entry."
+    parser = cli.Parser(prog=COMMAND, description=__doc__, epilog=more, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", required=True, metavar="NAME", help="the scene")
     parser.add_argument("--methods", metavar="A,B", help="methods, separated by commas (default: all that run on the scene)")
     parser.add_argument("--seeds", type=int, default=20, metavar="N", help="seeds of each entry; those there are kept (default: 20)")

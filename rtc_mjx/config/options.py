@@ -27,8 +27,8 @@ class Experts:
     """Demonstrations.
 
     Attributes:
-        train: how many to learn from.
-        test: how many to compare with during training and in `evaluate`.
+        train: demonstrations to learn from.
+        test: demonstrations to compare with, during training and in `evaluate`.
     """
 
     train: int = 8192
@@ -40,9 +40,9 @@ class Intervals:
     """Numbers of updates between events; `test` and `save` are multiples of `log`.
 
     Attributes:
-        log: a line of metrics.
-        test: the scene's metrics on test episodes.
-        save: a checkpoint.
+        log: updates from one line of metrics to the next.
+        test: updates from one test on test episodes to the next, a multiple of `log`.
+        save: updates from one checkpoint to the next, a multiple of `log`.
     """
 
     log: int = 100
