@@ -14,8 +14,8 @@ from rtc_mjx.config.files import defaults, read
 from rtc_mjx.config.options import Config, flat, to_dict
 from rtc_mjx.config.ranges import check
 from rtc_mjx.errors import UsageError
-from rtc_mjx.methods import method_name
-from rtc_mjx.scenes import scene_type
+from rtc_mjx.methods import METHODS, method_name
+from rtc_mjx.scenes import SCENES, scene_type
 
 
 def from_command_line(argv: Sequence[str], prog: str) -> Config:
@@ -85,7 +85,12 @@ def _parse(config: Config, argv: list[str], prog: str) -> Config:
 
 
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")  # of terminals
-DESCRIPTION = """Trains a method on a scene. `--scene NAME` and `--method NAME` choose; all else has a default (configs/<scene>.toml)."""
+DESCRIPTION = f"""Trains a method on a scene.
+
+`--scene NAME` (default: double_goal): {", ".join(SCENES)}; with --help, the options and defaults of that scene.
+`--method NAME` (default: rtc_c): {", ".join(METHODS)}.
+All else has a default (configs/<scene>.toml).
+"""
 
 
 def _one_line(boxed: str, prog: str) -> str:
