@@ -11,6 +11,7 @@ from rich.table import Table
 
 from rtc_mjx import cache, cli, config, dataset, evaluate, reference
 from rtc_mjx.config import Config
+from rtc_mjx.errors import UsageError
 
 COMMAND = "python -m rtc_mjx.experts"
 
@@ -32,6 +33,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--episodes", type=int, default=512, metavar="N", help="test episodes (default %(default)s)")
     options, rest = parser.parse_known_args(argv)
     cli.refuse(rest, COMMAND, method="experts have none", run="there is no run", resume="there is no run")
+    if others := [word for word in rest if word.startswith("--") and not word.startswith("--scene.")]:
+        raise UsageError(f"{COMMAND}: {others[0]} is not an option here; those of the scene are, --scene.NAME VALUE (see --help)")
     cli.at_least(4, episodes=options.episodes)
     asked = ["--scene", options.scene, "--method", "bc", *rest, "--experts.test", str(options.episodes)]
     settings = config.from_command_line(asked, COMMAND)

@@ -138,7 +138,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     elif len(options.places) == 1 and options.places[0].is_dir() and not (options.places[0] / "config.json").is_file():
         text = of_results(options.places[0])
     else:
-        raise UsageError("one folder of results is needed, or runs and --out DIR")
+        absent = [str(place) for place in options.places if not place.is_dir()]
+        told = f"{', '.join(absent)}: no such folder; " if absent else ""
+        raise UsageError(f"{told}one folder of results is needed, or runs and --out DIR")
     cli.console().print(Markdown(text))
 
 

@@ -6,7 +6,7 @@
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ Record = Mapping[str, Any]
 EVALUATION = frozenset(("metrics", "types", "reference", "update", "seeds", "episodes", "asked", "commit"))
 LOSSES = ("reconstruction", "cloning", "adversarial", "type_kl", "accuracy_expert", "accuracy_policy")  # curves beside the main metrics
 FAILED = ".failed.json"
+OF_A_RUN = ("config.json", "evaluation.json", "type_shift.json")  # beside results they are not taken for any
 DIGITS = 5  # of a learning curve
 
 
@@ -64,11 +65,18 @@ def of_run(run: Run, study: str = "") -> dict[str, Any]:
 
 
 def curves(run: Run) -> dict[str, dict[str, Any]]:
-    """Main metrics and losses by name: the `updates`, and of each the numbers `per_seed`."""
+    """Main metrics and losses by name: the `updates`, and of each the numbers `per_seed`.
+
+    Raises:
+        UsageError: metrics.jsonl is damaged.
+    """
     held, out = run.metrics(), {}
     for name in (*run.config.scene.main_metrics, *LOSSES):
         if lines := [line for line in held if name in line]:
-            values = [[float(f"{x:.{DIGITS}g}") for x in line[name]] for line in lines]
+            try:
+                values = [[float(f"{x:.{DIGITS}g}") for x in line[name]] for line in lines]
+            except (TypeError, ValueError) as error:
+                raise UsageError(f"{run.metrics_file} is damaged: '{name}' of some line is not a list of numbers ({error})") from error
             out[name] = {"updates": [line["update"] for line in lines], "per_seed": values}
     return out
 
@@ -105,10 +113,10 @@ def read(folder: Path) -> dict[str, Record]:
     """All results in a folder by name, methods first, as METHODS lists them; then their variations.
 
     Raises:
-        UsageError: a file is damaged, or they are of several scenes.
+        UsageError: a file is damaged or of another version, or they are of several scenes.
     """
-    held = {file.name.removesuffix(".json"): _parsed(file) for file in sorted(folder.glob("*.json"))}
-    held = {name: record for name, record in held.items() if _is_result(record)}
+    files = [file for file in sorted(folder.glob("*.json")) if file.name not in OF_A_RUN]
+    held = {file.name.removesuffix(".json"): record for file in files if _is_result(record := _parsed(file), file)}
     failed = {name.removesuffix(".failed"): record for name, record in held.items() if "failed" in record}
     records = {name: record for name, record in held.items() if "failed" not in record} | failed
     scenes = sorted({record["scene"] for record in records.values()})
@@ -117,10 +125,43 @@ def read(folder: Path) -> dict[str, Record]:
     return {name: records[name] for name in sorted(records, key=_place)}
 
 
-def _is_result(record: Any) -> bool:
+def _is_result(record: Any, file: Path) -> bool:
+    """Whether it is one, and not a JSON file of something else.
+
+    Raises:
+        UsageError: it is one, but cannot be read as one.
+    """
     if not (isinstance(record, dict) and {"scene", "method"} <= set(record)):
         return False
-    return "failed" in record or set(record) >= EVALUATION | {"config"}
+    if "failed" in record:
+        return True
+    if absent := sorted((EVALUATION | {"config", "curves"}) - set(record)):
+        raise UsageError(f"{file} lacks {', '.join(absent)}: it is damaged or of another version; make it again, or take it away")
+    try:
+        wrong = next(_wrong(record), None)
+    except (AttributeError, KeyError, TypeError) as error:
+        wrong = f"{type(error).__name__}: {error}"
+    if wrong:
+        raise UsageError(f"{file} is damaged: {wrong}; make it again, or take it away")
+    return True
+
+
+def _wrong(record: Record) -> Iterator[str]:
+    """What is not as it should be in a result that has all its parts."""
+    count, table = record["seeds"], record["config"]
+    if not isinstance(count, int) or count < 1:
+        yield f"'seeds' is {count!r}, a number of seeds is needed"
+    if absent := {"scene", "method", "first_seed", "seeds", "updates"} - set(table):
+        yield f"'config' lacks {', '.join(sorted(absent))}"
+    if "name" not in table["scene"]:
+        yield "'config' lacks the scene's name"
+    if absent := {"expert", "expert_vs_expert"} - set(record["reference"]):
+        yield f"'reference' lacks {', '.join(sorted(absent))}"
+    for source, metrics in {"metrics": record["metrics"], **record["types"]}.items():
+        for name, held in metrics.items():
+            values = held["per_seed"]
+            if len(values) != count or not all(isinstance(x, float | int) for x in (*values, held["mean"], held["std"])):
+                yield f"{name} ({source}) is not {count} numbers"
 
 
 def _place(name: str) -> tuple[int, int, str, float, str]:

@@ -191,7 +191,17 @@ class Run:
             return update, state, float(notes["wall_s"])
         if failed:
             raise UsageError(f"{self.folder} has no whole checkpoint: {'; '.join(failed)}")
-        raise UsageError(f"{self.folder} has no whole checkpoint yet; --resume goes on with the training")
+        self.check_checkpoint()
+        raise AssertionError("a checkpoint was neither read nor failed")
+
+    def check_checkpoint(self) -> None:
+        """That there is a checkpoint at all, whole or not.
+
+        Raises:
+            UsageError: there is none.
+        """
+        if next(self.checkpoints(), None) is None:
+            raise UsageError(f"{self.folder} has no whole checkpoint yet; --resume goes on with the training")
 
     def checkpoints(self) -> Iterator[int]:
         """Updates at which checkpoints stand, newest first."""

@@ -50,6 +50,7 @@ def restored(run: Run) -> tuple[Learner, int, TrainState, float]:
         UsageError: it has none; or the recordings it learned from are not there any more.
     """
     config = run.config
+    run.check_checkpoint()
     run.check_recordings()
     learner = config.learner(dataset.statistics(config.scene, dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN)))
     return learner, *run.restore(start_shapes(learner, config.all_seeds))

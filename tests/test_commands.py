@@ -104,6 +104,7 @@ def test_a_message_in_colours_is_one_plain_line():
         (study, ["--results", "out", "--run=runs/x"], "--run is not an option here; --runs DIR"),
         (study, ["--results", "out", "--name", ".."], "--name ..: a name is needed"),
         (experts, ["--method", "rtc"], "--method is not an option here"),
+        (experts, ["--seeds", "4"], "--seeds is not an option here; those of the scene are"),
     ],
 )
 def test_options_of_one_training_are_no_options_of_a_study(command, options, named):

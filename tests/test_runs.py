@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from learning import ON_SCENE, SCENE, settings
 
-from rtc_mjx import config, evaluate, populations, render, report, train
+from rtc_mjx import config, dataset, evaluate, populations, render, report, results, train
 from rtc_mjx.config import Config
 from rtc_mjx.errors import RunError, UsageError
 from rtc_mjx.runs import Run
@@ -177,6 +177,10 @@ def test_metrics_cut_short_by_a_crash_lose_only_the_last_line(whole, tmp_path):
         run.metrics_file.write_bytes(held)
     run.rewind(20)
     assert [line["update"] for line in run.metrics()] == [10, 20]
+    for word in ('"many"', "3.0", "[null, 1.0]"):
+        run.metrics_file.write_text(f'{{"update": 10, "return": {word}}}\n')
+        with pytest.raises(UsageError, match="'return' of some line is not a list of numbers"):
+            results.curves(run)
 
 
 def test_full_disk_loses_no_checkpoint(whole, tmp_path):
@@ -449,6 +453,9 @@ def test_incomplete_and_damaged_runs_are_refused(whole, tmp_path):
     refused(["--run", str(run.folder), "--resume"], "config.json is damaged")
     (run.folder / "config.json").write_text(json.dumps({"scene": {"name": "double_goal", "steps": "x"}}))
     refused(["--run", str(run.folder), "--resume"], "steps.*'x'")
+    (run.folder / "config.json").write_text(json.dumps(json.loads((whole.folder / "config.json").read_text()) | {"batch": 0}))
+    with pytest.raises(UsageError, match=r"config\.json: --batch 0: at least 4"):
+        Run.open(run.folder)
 
 
 @pytest.mark.parametrize(
@@ -466,6 +473,7 @@ def test_incomplete_and_damaged_runs_are_refused(whole, tmp_path):
         (populations.main, ["RUN", "RUN", "--out", "picture.png"], "one run a method"),
         (populations.main, ["RUN", "--out", "picture.png", "--agents", "0"], "agents 0"),
         (report.main, ["/nowhere", "--out", "x"], "nowhere is not a run"),
+        (report.main, ["/nowhere"], "nowhere: no such folder"),
     ],
 )
 def test_commands_refuse_wrong_use_in_one_line(main, argv, named, whole):
@@ -474,8 +482,10 @@ def test_commands_refuse_wrong_use_in_one_line(main, argv, named, whole):
     assert "\n" not in str(caught.value)
 
 
-def test_evaluation_of_a_run_without_a_checkpoint_is_refused(tmp_path):
+def test_evaluation_of_a_run_without_a_checkpoint_is_refused(tmp_path, monkeypatch):
+    """Before anything is made for it."""
     run = Run.create(settings("bc", tmp_path / "run"))
+    monkeypatch.setattr(dataset, "demonstrations", None)
     with pytest.raises(UsageError, match="no whole checkpoint"):
         evaluate.evaluate(run, 16)
 

@@ -494,6 +494,35 @@ def test_tables_and_figures_are_made_again_from_the_json_files_alone(again, whol
         report.main([str(out)])
 
 
+@pytest.mark.parametrize(
+    ("damage", "named"),
+    [
+        ({"metrics": None}, r"lacks metrics: .*another version"),
+        ({"curves": None, "config": None}, "lacks config, curves"),
+        ({"config": {}}, "'config' lacks first_seed, method"),
+        ({"config": []}, "damaged"),
+        ({"reference": {}}, "'reference' lacks expert"),
+        ({"seeds": []}, r"'seeds' is \[\]"),
+        ({"seeds": 9}, "not 9 numbers"),
+        ({"types": {"prior": {"return": {"mean": "many", "std": 0.0, "per_seed": [1.0, 2.0]}}}}, r"return \(prior\) is not"),
+        ({"types": {"prior": {"return": 3.0}}}, "damaged"),
+    ],
+)
+def test_a_result_of_wrong_content_is_one_line(damage, named, whole, tmp_path):
+    held = json.loads((whole / "double_goal" / "bc.json").read_text()) | damage
+    (tmp_path / "bc.json").write_text(json.dumps({key: value for key, value in held.items() if value is not None}))
+    with pytest.raises(UsageError, match=rf"bc\.json.*{named}") as told:
+        report.main([str(tmp_path)])
+    assert "\n" not in str(told.value)
+
+
+def test_json_files_of_other_things_are_no_results(tmp_path):
+    for text in ('{"scene": "double_goal"}', "[]", "3"):
+        (tmp_path / "notes.json").write_text(text)
+        with pytest.raises(UsageError, match="holds no results"):
+            report.main([str(tmp_path)])
+
+
 def test_committed_results_can_be_read(tmp_path):
     """Results of earlier versions, too, become tables."""
     for place in {file.parent for file in ROOT.glob("results/*/table.md")}:

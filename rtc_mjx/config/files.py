@@ -101,7 +101,7 @@ def read(folder: Path) -> Config:
     """The settings of a run directory.
 
     Raises:
-        UsageError: there is no run, or its config.json is damaged or of another version.
+        UsageError: there is no run, or its config.json is damaged, of another version, or holds values that are not accepted.
     """
     file = folder / "config.json"
     if not file.is_file():
@@ -116,4 +116,7 @@ def read(folder: Path) -> Config:
     absent = [name for name in flat(to_dict(config)) if name not in {*flat(table), *later(config.method)}]
     if absent:  # today's default would not be what the run was made with
         raise UsageError(f"{file} lacks {', '.join(absent)}: it is damaged or of another version of rtc_mjx")
-    return check(dataclasses.replace(config, run=folder))
+    try:
+        return check(dataclasses.replace(config, run=folder))
+    except UsageError as error:
+        raise UsageError(f"{file}: {error}") from error
