@@ -7,10 +7,10 @@ CHECK_PYTHON := import sys; sys.exit(0 if sys.version_info[:2] in ((3, 11), (3, 
 
 .PHONY: test train lint clean
 
-# Test files run beside each other, as many as there are workers; each needs up to 6 GB.
+# Test files run beside each other, long ones first, as many as there are workers; each needs up to 6 GB.
 WORKERS ?= 2
 test: lint
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --durations 40 --durations-min 5
 
 # A run that was stopped goes on where it was.
 RUN := runs/intersection/rtc_c

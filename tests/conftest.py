@@ -1,14 +1,30 @@
-"""Shared by all tests: shapes are checked at run time, and compiled programs are kept between runs."""
+"""Shared by all tests: shapes are checked at run time, programs are compiled quickly and kept between runs, and long files begin first."""
 
-import jax
-import pytest
-from jaxtyping import install_import_hook
+import os
+
+# Programs are compiled once and run for moments: without most optimisations, and by the emitters of XLA that take less time.
+# Processes that tests start inherit both. What must be optimised asks for it (`optimised`).
+os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
+os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_use_fusion_emitters=false"
+
+import jax  # noqa: E402
+import pytest  # noqa: E402
+from jaxtyping import install_import_hook  # noqa: E402
 
 install_import_hook("rtc_mjx.physics", "beartype.beartype")  # before anything of the package is imported
 
-from rtc_mjx import cache  # noqa: E402
+from rtc_mjx import cache, cli  # noqa: E402
 
 cache.keep_compiled()
+cli.collect_garbage_less()
+
+LONG = ("driving_trained", "driving", "runs", "several", "scenes", "notebooks", "type_shift", "blocks", "scaling", "learning")
+
+
+def pytest_collection_modifyitems(items):
+    """Files that take longest first, so that no worker is left alone with one at the end."""
+    places = {f"test_{name}": place for place, name in enumerate(LONG)}
+    items.sort(key=lambda item: places.get(item.path.stem, len(LONG)))
 
 
 @pytest.fixture
@@ -18,10 +34,10 @@ def x64():
         yield
 
 
-@pytest.fixture
-def quick_to_compile():
-    """Without most optimisations: for programs that are compiled once and run for moments."""
+@pytest.fixture(scope="module")
+def optimised():
+    """Programs as users have them: for tests of how fast they are."""
     before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
+    jax.config.update("jax_disable_most_optimizations", False)
     yield
     jax.config.update("jax_disable_most_optimizations", before)

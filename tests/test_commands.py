@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="module")
-def rows():
+def rows(optimised):
     world = benchmark.WORLDS["point_mass"]()
     return [r for d in benchmark.DIRECTIONS for r in benchmark.measure("point_mass", world, 16, d, rounds=1)]
 

@@ -11,13 +11,10 @@ import pytest
 from jax import random
 from made import demonstrated, made
 
-from rtc_mjx import dataset, evaluate, train
-from rtc_mjx.config import Config, Experts, Intervals
+from rtc_mjx import dataset
 from rtc_mjx.errors import UsageError
 from rtc_mjx.geometry import project
-from rtc_mjx.learner import OptimiserOptions
 from rtc_mjx.logs import AMBER, GREEN, NO_SIGNAL, RED, VEHICLE, LoggedScene, RoadGraph, checked
-from rtc_mjx.models import ModelOptions
 from rtc_mjx.physics import PhysicsState, specialised_step, substates
 from rtc_mjx.rollout import rollout
 from rtc_mjx.scenes import SCENES, Actor, split_items
@@ -234,7 +231,6 @@ def test_observations_do_not_depend_on_where_and_which_way_the_world_lies(scene)
     assert np.allclose(*seen, atol=2e-2)
 
 
-@pytest.mark.usefixtures("quick_to_compile")
 def test_gradients_are_finite_and_right_through_a_collision(driving, x64):
     """The car runs into somebody who stands ahead: dx_T / da_t against central differences."""
     episode = jax.tree.map(lambda x: jnp.asarray(x[0], float if x.dtype.kind == "f" else None), demonstrated(driving.name)[0].episode)
@@ -592,22 +588,3 @@ def test_substates_end_where_the_rollout_goes_on():
     assert np.allclose(inner.qpos[0], states.qpos)
     last = jax.jit(step)(jax.tree.map(lambda x: x[-1], inner), one.trajectory.actions[3], jax.tree.map(lambda x: x[-1], around))
     assert np.allclose(last.qpos, one.trajectory.states.qpos[4], atol=1e-4)
-
-
-@pytest.mark.usefixtures("quick_to_compile")
-@pytest.mark.parametrize("method", ["rtc_c", "symphony"])
-def test_methods_train_on_the_intersection(method, tmp_path):
-    """A real, short training: losses by rollouts and by route labels, tests, evaluation with flipped signals."""
-    held = Config(
-        scene=SCENES["intersection"](steps=6, road_users=3), method=method, updates=2, batch=4, run=tmp_path / "run",
-        model=ModelOptions(width=8, discriminator_width=8, mixture=1, type_size=2, prior_components=2),
-        optimiser=OptimiserOptions(gradient="dynamics_only"), experts=Experts(train=16, test=4), every=Intervals(log=1, test=2, save=2),
-    )  # fmt: skip
-    run = train.train(held)
-    line = run.metrics()[-1]
-    assert line["update"] == 2 and {"collision_rate", "min_ade", "cloning"} <= set(line)
-    assert ("reconstruction" in line) is (method == "rtc_c") and ("type_nll" in line) is (method == "symphony")
-    assert line["trajectories_dropped"] == [0.0]
-    result = evaluate.evaluate(run, 4)
-    assert set(result["reaction"]) == {*result["types"], "expert"} and result["reaction"]["expert"]["like_expert"] == 1.0
-    assert 0 <= result["metrics"]["collision_rate"]["mean"] <= 1 and set(result["ranges"]) == {"curvature", "progress"}

@@ -154,7 +154,6 @@ def settings(method, folder):
 logged_drivers = functools.cache(dataset.demonstrations)  # the same for all methods
 
 
-@pytest.mark.usefixtures("quick_to_compile")
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_learns_from_recordings(method, tmp_path):
     held = settings(method, tmp_path)
@@ -168,7 +167,6 @@ def test_every_method_learns_from_recordings(method, tmp_path):
     assert any(jax.tree.leaves(moved))
 
 
-@pytest.mark.usefixtures("quick_to_compile")
 def test_a_training_on_recordings_is_tested_and_evaluated(tmp_path):
     run = train.train(settings("symphony", tmp_path / "run"))
     line = run.metrics()[-1]
@@ -314,7 +312,6 @@ def test_curvature_is_left_out_only_where_no_recording_logs_connectivity(mixed):
     assert "curvature_jsd" not in Recorded(data=str(mixed)).metrics(held, held)
 
 
-@pytest.mark.usefixtures("quick_to_compile")
 def test_features_and_notes_say_what_a_recording_lacks(mixed):
     """Those that do not log connectivity have no road edges either: they count for neither curvature nor off-road time."""
     for i in range(3):

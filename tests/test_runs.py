@@ -39,7 +39,6 @@ def whole(tmp_path_factory):
     return train.train(settings("rtc_c", tmp_path_factory.mktemp("whole") / "run", seeds=2))
 
 
-@pytest.mark.usefixtures("quick_to_compile")
 @pytest.mark.parametrize("method", ON_SCENE)
 def test_every_method_learns(method, tmp_path):
     """A real short training: what it clones or reconstructs falls, nothing is dropped, all that is logged is finite."""

@@ -80,7 +80,6 @@ def test_a_rollout_is_a_function_of_its_inputs(scene):
     assert np.allclose(again.states.qpos, held.trajectory.states.qpos, atol=1e-5)
 
 
-@pytest.mark.usefixtures("quick_to_compile")
 def test_rollout_matches_c_mujoco(scene, x64):
     held = jax.tree.map(lambda x: x[1].astype(float) if x.dtype.kind == "f" else x[1], experts(scene.name))
     track = rollout(scene, playback(scene, held.trajectory.actions), held.episode)
@@ -111,7 +110,6 @@ def test_features_and_metrics_are_finite_and_the_expert_equals_itself(scene):
 
 
 @pytest.mark.parametrize("scene", [DoubleGoal(), Intersection(steps=4, road_users=1)], ids=lambda scene: scene.name)
-@pytest.mark.usefixtures("quick_to_compile")
 def test_agents_are_compared_with_as_many_experts_as_they_have_rollouts(scene, tmp_path, monkeypatch):
     """They are made once, and those of the floor are others."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))

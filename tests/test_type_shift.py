@@ -255,7 +255,7 @@ def check_types(result, agents, metric):
     assert {"prior", "paired", "shuffled"} <= set(result["types"])
 
 
-@pytest.mark.usefixtures("quick_probe", "quick_to_compile")
+@pytest.mark.usefixtures("quick_probe")
 @pytest.mark.parametrize("method", ["rtc_d", "info_mgail_c", "bc"])
 def test_the_analysis_of_types_says_what_is_there_to_say(method, tmp_path):
     run = untrained(tmp_path / "run", "--scene.steps", str(SCENE.steps), "--seeds", "2", method=method)
@@ -281,7 +281,7 @@ def test_the_analysis_of_types_says_what_is_there_to_say(method, tmp_path):
         type_shift.main(["--run", str(run.folder), "--episodes", "3"])
 
 
-@pytest.mark.usefixtures("quick_probe", "quick_to_compile")
+@pytest.mark.usefixtures("quick_probe")
 @pytest.mark.parametrize(("scene", "cars"), [("intersection", 2), ("womd", 1)])
 def test_the_analysis_of_types_on_driving(scene, cars, tmp_path):
     """Several agents of an episode are agents each; recordings have one expert to an episode, and no signals that could be turned round."""
