@@ -75,7 +75,7 @@ def whole_or_small(scene: str, methods: Sequence[str], folder: Path, small: Sequ
         else:
             return runs
     folder = Path(tempfile.mkdtemp())
-    return {name: complete(Entry(name, name, tuple(small)), scene, folder / name, analysed=False) for name in methods}
+    return {name: train.train(resolved(Entry(name, name, tuple(small)), scene, "--run", str(folder / name))) for name in methods}
 
 
 def write(runs: Mapping[str, Run], folder: Path, out: Path, pending: bool = False) -> str:

@@ -92,13 +92,13 @@ def learn(run: Run, config: Config, grid: Grid, team: Team) -> None:
         RunError: a checkpoint could not be written.
         KeyboardInterrupt: interrupted; a checkpoint was saved first.
     """
-    if team.leads:
-        sys.stderr.write(f"{run.folder}: demonstrations and a compiled program come first: minutes, unless kept from before\n")
+    announce(run, team, "demonstrations")
     expert = dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN)
     learner = config.learner(dataset.statistics(config.scene, expert))
     state, update, before = begin_together(run, learner, config, team)
     if update < config.updates:
         run.note_trained_by(provenance.code())
+        announce(run, team, "compiling")
     grid.connect()
     state, data = grid.by_seed(state), grid.everywhere(dataset.without_truth(expert))
     test, chunks = Tests(config, learner, grid), functools.cache(lambda length: compiled_chunk(learner, length, grid))
@@ -121,6 +121,12 @@ def learn(run: Run, config: Config, grid: Grid, team: Team) -> None:
             if stop:
                 team.exchange(None)  # the checkpoint is there
                 raise KeyboardInterrupt
+
+
+def announce(run: Run, team: Team, what: str) -> None:
+    """Says what is done before there is anything to show of a training."""
+    if team.leads:
+        sys.stderr.write(f"{run.folder}: {what} (minutes, unless kept from before)\n")
 
 
 def devices(config: Config, team: Team) -> Grid:
