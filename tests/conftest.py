@@ -18,7 +18,9 @@ from rtc_mjx import cache, cli  # noqa: E402
 cache.keep_compiled()
 cli.collect_garbage_less()
 
-LONG = ("driving_trained", "driving", "runs", "several", "scenes", "notebooks", "type_shift", "blocks", "scaling", "learning")
+LONG = (
+    "driving_trained", "driving", "runs", "several", "scenes", "recorded", "notebooks", "type_shift", "study", "blocks", "step", "scaling", "learning",
+)  # fmt: skip
 
 
 def pytest_collection_modifyitems(items):
