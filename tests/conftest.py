@@ -19,7 +19,8 @@ cache.keep_compiled()
 cli.collect_garbage_less()
 
 LONG = (
-    "driving_trained", "driving", "runs", "several", "scenes", "recorded", "notebooks", "type_shift", "study", "blocks", "step", "scaling", "learning",
+    "driving_trained", "driving", "runs", "several", "scenes", "recorded", "notebooks",
+    "type_shift", "study", "blocks", "step", "scaling", "learning",
 )  # fmt: skip
 
 
