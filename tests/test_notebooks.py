@@ -38,7 +38,7 @@ def test_notebooks_run_and_show_their_figures(file, tmp_path, monkeypatch):
     if file.stem != WITHOUT_RESULTS:
         shutil.copytree(ROOT / "results", tmp_path / "results")
     notebook = nbformat.read(file, as_version=4)
-    NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(place)}}).execute()
+    NotebookClient(notebook, timeout=1500, kernel_name="python3", resources={"metadata": {"path": str(place)}}).execute()
     outputs = [output for cell in code(notebook) for output in cell.outputs]
     assert any("image/png" in output.get("data", {}) for output in outputs)
     assert not any(output.get("name") == "stderr" for output in outputs)
