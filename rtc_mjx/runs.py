@@ -171,6 +171,7 @@ class Run:
         Raises:
             UsageError: there is no whole one, or its networks have other shapes than those that the settings make.
         """
+        self.check_checkpoint()
         failed = []
         for update in self.checkpoints():
             with quiet_destructors():
@@ -189,10 +190,7 @@ class Run:
             for reason in failed:
                 logging.getLogger("rtc_mjx").warning("%s, using that of update %d", reason, update)
             return update, state, float(notes["wall_s"])
-        if failed:
-            raise UsageError(f"{self.folder} has no whole checkpoint: {'; '.join(failed)}")
-        self.check_checkpoint()
-        raise AssertionError("a checkpoint was neither read nor failed")
+        raise UsageError(f"{self.folder} has no whole checkpoint: {'; '.join(failed)}")
 
     def check_checkpoint(self) -> None:
         """That there is a checkpoint at all, whole or not.
