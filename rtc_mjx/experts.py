@@ -32,7 +32,6 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--scene", required=True, metavar="NAME", help="the scene")
     parser.add_argument("--episodes", type=int, default=512, metavar="N", help="test episodes (default %(default)s)")
     options, rest = parser.parse_known_args(argv)
-    cli.refuse(rest, COMMAND, method="experts have none", run="there is no run", resume="there is no run")
     if others := [word for word in rest if word.startswith("--") and not word.startswith("--scene.")]:
         raise UsageError(f"{COMMAND}: {others[0]} is not an option here; those of the scene are, --scene.NAME VALUE (see --help)")
     cli.at_least(4, episodes=options.episodes)

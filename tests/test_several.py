@@ -62,8 +62,8 @@ def as_double(tree):
     return jax.tree.map(lambda x: x.astype(float) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
 
 
-def test_cars_far_from_each_other_drive_as_if_alone():
-    cars = 3
+@pytest.mark.parametrize("cars", [2, 3])
+def test_cars_far_from_each_other_drive_as_if_alone(cars):
     poses, speeds = [[20.0 + 160.0 * i, 0.1 * i, 0.0] for i in range(cars)], [8.0 + i for i in range(cars)]
     together, alone = Intersection(steps=8, road_users=4 - cars, controlled=cars), Intersection(steps=8, road_users=3)
     keys = random.split(random.key(0), cars)
