@@ -129,11 +129,13 @@ def reencoding(held: Trained, test: Demonstration) -> dict[str, list[float]]:
         def typed(episode: Demonstration) -> Array:  # a label is one of the episode's own routes; encoders and Q see the trajectory alone
             return learner.types(learner.method.reads, agent, Demonstration(episode.episode, mine.trajectory, ()), draw).agent_type
 
-        out = {"demonstration": told(mine, mine.trajectory, typed(mine))}
-        for name, place in {"rollout": mine, "rollout_elsewhere": elsewhere}.items():
+        def rollout(place: Demonstration) -> Array:
             g = typed(place)
-            out[name] = told(place, learner.play(agent, place.episode, g, scene.key_each(noise)), g)
-        return out
+            return told(place, learner.play(agent, place.episode, g, scene.key_each(noise)), g)
+
+        places = jax.tree.map(lambda *x: jnp.stack(x), mine, elsewhere)
+        here, there = lax.map(rollout, places)  # in turn: the simulation is compiled once
+        return {"demonstration": told(mine, mine.trajectory, typed(mine)), "rollout": here, "rollout_elsewhere": there}
 
     other = evaluate.elsewhere(scene, test)
     keys = random.split(stream("type shift", 2), len(jax.tree.leaves(test)[0]))

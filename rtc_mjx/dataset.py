@@ -1,6 +1,7 @@
 """Demonstrations: experts let loose in a scene, once, and kept on disk under a hash of everything that made them."""
 
 import dataclasses
+import functools
 import inspect
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 
 from rtc_mjx import cache
 from rtc_mjx.errors import UsageError
-from rtc_mjx.keys import stream
+from rtc_mjx.keys import folded, stream
 from rtc_mjx.models import Statistics
 from rtc_mjx.pytree import in_parts
 from rtc_mjx.rollout import rollout
@@ -20,20 +21,13 @@ from rtc_mjx.trajectory import Demonstration, Episode
 
 # seeds of the independent sets: to learn from, to compare with, to compare these with, to probe
 TRAIN, TEST, SECOND_TEST, PROBED = 0, 1, 2, 3
-CHUNK = 1024  # episodes simulated at once
+AT_ONCE = 128  # episodes that experts drive at once, however many there are: one program does for all sets of a scene
 
 
-def demonstrate(scene: Scene, key: jax.Array, change: Callable[[Episode], Episode | None] = lambda episode: episode) -> Demonstration:
-    """One episode driven by the scene's expert, after a change to it.
-
-    Raises:
-        UsageError: the scene has nothing to change.
-    """
+def demonstrate(scene: Scene, key: jax.Array) -> Demonstration:
+    """One episode driven by the scene's expert."""
     outside, inside = jax.random.split(key)
-    episode = change(scene.reset(outside))
-    if episode is None:
-        raise UsageError(f"scene {scene.name} has nothing to change")
-    return driven(scene, episode, inside)
+    return driven(scene, scene.reset(outside), inside)
 
 
 def driven(scene: Scene, episode: Episode, key: jax.Array) -> Demonstration:
@@ -53,20 +47,45 @@ def demonstrations(scene: Scene, count: int, seed: int) -> Demonstration:
     episodes = scene.recorded("test" if seed == TEST else "train", count)
     if episodes is not None:
         return _replayed(scene, episodes)
-    make = jax.jit(jax.vmap(lambda key: demonstrate(scene, key)))
-    shapes = jax.eval_shape(make, jax.random.split(stream("demonstrations", seed), count))
+    shapes = jax.eval_shape(jax.vmap(lambda key: demonstrate(scene, key)), _keys(count, seed))
     file = cache.folder() / "demonstrations" / f"{scene.name}-{fingerprint(scene, count, seed)}.npz"
     leaves = _fitting(cache.read_arrays(file), jax.tree.leaves(shapes))
     if leaves is None:
-        leaves = jax.tree.leaves(_made(make, count, seed, CHUNK))
+        leaves = jax.tree.leaves(drive(scene, *begun(scene, count, seed)))
         cache.write_arrays(file, {str(i): x for i, x in enumerate(leaves)})
     return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
 
 
 def _replayed(scene: Scene, episodes: Episode) -> Demonstration:
     """Recorded episodes driven by their logged experts, as numpy arrays."""
-    run = jax.jit(jax.vmap(lambda episode: driven(scene, episode, jax.random.key(0))))  # a logged expert draws nothing
-    return in_parts(run, episodes, CHUNK)
+    count = len(jax.tree.leaves(episodes)[0])
+    return drive(scene, episodes, jax.vmap(jax.random.key)(np.zeros(count, int)))  # a logged expert draws nothing
+
+
+def begun(scene: Scene, count: int, seed: int) -> tuple[Episode, jax.Array]:
+    """A seed's episodes, and the keys of the minds of those who drive them."""
+    outside, inside = jnp.moveaxis(jax.vmap(jax.random.split)(_keys(count, seed)), 1, 0)
+    return in_parts(_resetter(scene), outside, AT_ONCE, fill=True), inside
+
+
+def drive(scene: Scene, episodes: Episode, minds: jax.Array) -> Demonstration:
+    """Episodes (leading axis) driven by experts, each with a mind drawn by a key, as numpy arrays."""
+    return in_parts(lambda held: driver(scene)(*held), (episodes, minds), AT_ONCE, fill=True)
+
+
+@functools.lru_cache(maxsize=16)
+def driver(scene: Scene) -> Callable[[Episode, jax.Array], Demonstration]:
+    """`driven` of a vector of episodes and one of keys, compiled."""
+    return jax.jit(jax.vmap(functools.partial(driven, scene)))
+
+
+@functools.lru_cache(maxsize=16)
+def _resetter(scene: Scene) -> Callable[[jax.Array], Episode]:
+    return jax.jit(jax.vmap(scene.reset))
+
+
+def _keys(count: int, seed: int) -> jax.Array:
+    return jax.random.split(stream("demonstrations", seed), count)
 
 
 def by_others(scene: Scene, count: int, seed: int, minds: int) -> Demonstration:
@@ -75,17 +94,11 @@ def by_others(scene: Scene, count: int, seed: int, minds: int) -> Demonstration:
     Raises:
         UsageError: the scene's episodes have one expert each.
     """
-
-    def again(key: jax.Array) -> Demonstration:
-        outside, inside = jax.random.split(key)
-        episode = scene.reset(outside)
-
-        return jax.vmap(lambda mind: driven(scene, episode, jax.random.fold_in(inside, mind)))(1 + jnp.arange(minds))
-
     if not scene.redrivable:
         raise UsageError(f"scene {scene.name}: recorded episodes have one expert each")
-
-    return _made(jax.jit(jax.vmap(again)), count, seed, max(1, CHUNK // minds))
+    episodes, inside = begun(scene, count, seed)
+    held = drive(scene, jax.tree.map(lambda x: np.repeat(x, minds, axis=0), episodes), folded(inside, 1 + jnp.arange(minds)))
+    return jax.tree.map(lambda x: x.reshape(count, minds, *x.shape[1:]), held)
 
 
 def redriven(scene: Scene, count: int, seed: int, change: Callable[[Episode], Episode | None]) -> Demonstration:
@@ -94,12 +107,11 @@ def redriven(scene: Scene, count: int, seed: int, change: Callable[[Episode], Ep
     Raises:
         UsageError: the scene has nothing to change.
     """
-    return _made(jax.jit(jax.vmap(lambda key: demonstrate(scene, key, change))), count, seed, CHUNK)
-
-
-def _made(make: Callable[[jax.Array], Demonstration], count: int, seed: int, at_once: int) -> Demonstration:
-    """What a function makes of the keys of a seed's episodes, as numpy arrays."""
-    return in_parts(make, jax.random.split(stream("demonstrations", seed), count), at_once)
+    episodes, inside = begun(scene, count, seed)
+    changed = jax.jit(jax.vmap(change))(episodes)
+    if changed is None:
+        raise UsageError(f"scene {scene.name} has nothing to change")
+    return drive(scene, changed, inside)
 
 
 def fingerprint(scene: Scene, count: int, seed: int) -> str:

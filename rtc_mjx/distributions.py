@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from rtc_mjx.pytree import pytree
 
-UNIFORM_SHARE = 0.01  # of a one-hot distribution: keeps every log-probability and KL finite (method notes, section 3)
+UNIFORM_SHARE = 0.01  # of a one-hot distribution: keeps every log-probability and KL finite
 
 
 class Distribution(Protocol):

@@ -1,6 +1,6 @@
 """How an agent does on its own, and what conditional type shift costs it.
 
-Three rollouts of the same test episodes (method notes, section 7): types from each episode's own demonstration (paired), from
+Three rollouts of the same test episodes: types from each episode's own demonstration (paired), from
 another episode's (shuffled), from the prior. Paired to shuffled is conditional shift, shuffled to prior is marginal shift. The
 expert, and expert against expert, stand beside them: the ceiling, and the floor of every divergence (`rtc_mjx.reference`); so does the
 replay of the logs, where experts are others than those of the logs.
@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import rich.progress
-from jax import random
+from jax import lax, random
 from jaxtyping import Array, Float, Int
 from rich.console import Console
 from rich.table import Table
@@ -85,14 +85,22 @@ def roller(learner: Learner, samples: int, watch: Watch = iter, grid: Grid = ONE
     """
 
     def one(networks: Networks, mine: Demonstration, given: Donors, key: Array) -> dict[str, dict[str, Array]]:
-        agent = learner.agent(networks)
+        agent, scene = learner.agent(networks), learner.scene
         draw, noise = random.split(key)
-        types = {"prior": learner.types(learner.method.test_types, agent, mine, draw)}
-        reads = learner.method.reads
-        types |= {name: learner.types(reads, agent, Demonstration(mine.episode, track, ()), draw) for name, track in given.items()}
-        keys = learner.scene.key_each(noise)
-        tracks = {name: learner.play(agent, mine.episode, typed.agent_type, keys) for name, typed in types.items()}
-        return {name: learner.scene.features(mine, track) | {FINITE: _finite(track)} for name, track in tracks.items()}
+        keys = scene.key_each(noise)
+
+        def read(track: Trajectory) -> Array:
+            return learner.types(learner.method.reads, agent, Demonstration(mine.episode, track, ()), draw).agent_type
+
+        def described(g: Array) -> dict[str, Array]:
+            track = learner.play(agent, mine.episode, g, keys)
+            return scene.features(mine, track) | {FINITE: _finite(track)}
+
+        types = learner.types(learner.method.test_types, agent, mine, draw).agent_type[None]
+        if given:
+            types = jnp.concatenate([types, lax.map(read, _stacked(given.values()))])
+        features = lax.map(described, types)  # sources take turns in one loop: a copy of the simulation for each would be compiled
+        return {name: jax.tree.map(lambda x, i=i: x[i], features) for i, name in enumerate(["prior", *given])}
 
     def several(networks: Networks, held: tuple[Demonstration, Donors, Array]) -> dict[str, dict[str, Array]]:
         return jax.vmap(jax.vmap(functools.partial(one, networks), in_axes=(None, None, 0)))(*held)
@@ -119,6 +127,11 @@ def part_size(count: int, samples: int) -> int:
 def at_once() -> int:
     """How many rollouts are simulated at once."""
     return AT_ONCE.get(jax.default_backend(), MANY)
+
+
+def _stacked(trees: Iterable[Any]) -> Any:
+    """Trees of one structure as one, with a leading axis."""
+    return jax.tree.map(lambda *x: jnp.stack(x), *trees)
 
 
 def _finite(track: Trajectory) -> Array:
@@ -201,7 +214,7 @@ def reaction(learner: Learner, roll: RollTrained, shown: Demonstration, features
 def reactions(
     learner: Learner, roll: RollTrained, shown: Demonstration, features: dict[str, Features], key: Array
 ) -> dict[str, dict[str, list[float]]]:
-    """What agents do when luck is turned round at the same type (method notes, section 7), beside the experts with the same minds.
+    """What agents do when luck is turned round at the same type, beside the experts with the same minds.
 
     On the first episodes, as many as `REACTIONS` are rollouts of; `key` is that of the rollouts that `features` are of.
 

@@ -1,4 +1,4 @@
-"""The methods, as data: which types a branch acts under, and what it loses (method notes, section 3).
+"""The methods, as data: which types a branch acts under, and what it loses.
 
 A branch takes a slice of each minibatch. Slices may overlap: InfoMGAIL clones and plays every episode, under different types;
 RTC splits the minibatch at `encoder_share`, the paper's f. Whether L_adv is of all branches that name it is a setting of its own

@@ -33,7 +33,9 @@ def pytree(cls: type[T]) -> type[T]:
     return frozen
 
 
-def in_parts(function: Callable[[Any], Any], tree: Any, at_once: int, watch: Callable[[Sequence[Any]], Iterable[Any]] = iter) -> Any:
+def in_parts(
+    function: Callable[[Any], Any], tree: Any, at_once: int, watch: Callable[[Sequence[Any]], Iterable[Any]] = iter, fill: bool = False
+) -> Any:
     """A compiled function of a tree's leading axis, as numpy arrays: so many rows at once as memory allows.
 
     All parts are of one shape, so that one program does; rows that fill up the last part are cut off again.
@@ -43,9 +45,10 @@ def in_parts(function: Callable[[Any], Any], tree: Any, at_once: int, watch: Cal
         tree: arrays with equal leading axes.
         at_once: rows of a part.
         watch: goes through the parts, such as a progress bar.
+        fill: whether fewer rows than `at_once` are filled up to as many, so that one program does for any number of rows.
     """
     count = jax.tree.leaves(tree)[0].shape[0]
-    at_once, parts = min(count, at_once), []
+    at_once, parts = at_once if fill else min(count, at_once), []
     for first in watch(range(0, count, at_once)):
         rows = np.arange(first, first + at_once) % count
         found = jax.device_get(function(jax.tree.map(lambda x, rows=rows: x[rows], tree)))

@@ -6,21 +6,19 @@
 Bins are the experts' alone (`Bins`): what an agent does widens none of them, and what no expert ever does has bins of its own.
 """
 
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import jax
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from rtc_mjx import dataset, evaluate, metrics, reference
 from rtc_mjx.keys import stream
-from rtc_mjx.scenes import Scene, merged
+from rtc_mjx.scenes import Features, Scene, merged
 from rtc_mjx.trained import Trained
-from rtc_mjx.trajectory import Demonstration, Trajectory
+from rtc_mjx.trajectory import Demonstration
 
 BINS = 10  # between the least and the most that experts do
 EPISODES = 64  # that are compared, at most
@@ -72,7 +70,7 @@ def realism(held: Trained, test: Demonstration, experts: int, watch: Callable[..
     scene, count = held.config.scene, min(EPISODES, len(jax.tree.leaves(test)[0]))
     mine = jax.tree.map(lambda x: x[:count], test)
     others = dataset.without_truth(dataset.by_others(scene, count, dataset.TEST, 2 * experts))
-    theirs, all_experts = jax.device_get(_described(scene, mine, others)), reference.expert_features(scene, test)
+    theirs, all_experts = _described(scene, mine, others), reference.expert_features(scene, test)
     ours = evaluate.roller(held.learner, experts, watch)(held.networks, mine, {}, stream("type shift", 3))["prior"]
     evaluate.check_finite(ours[evaluate.FINITE], "prior")
     if scene.agents > 1:  # each agent by itself: of (episodes, experts, agents, ...) and (seeds, rollouts, episodes, agents, ...)
@@ -120,10 +118,9 @@ def _interval(episodes: Float[np.ndarray, "episodes"]) -> list[float]:
     return [float(end) for end in metrics.bootstrap(episodes)]
 
 
-def _described(scene: Scene, held: Demonstration, others: Demonstration) -> dict[str, Array]:
+def _described(scene: Scene, mine: Demonstration, others: Demonstration) -> Features:
     """Features of other experts' trajectories in the episodes of demonstrations: (episodes, experts)."""
-
-    def one(mine: Demonstration, tracks: Trajectory) -> dict[str, Array]:
-        return jax.vmap(functools.partial(scene.features, mine))(tracks)
-
-    return jax.jit(lambda mine, tracks: lax.map(lambda held: one(*held), (mine, tracks)))(held, others.trajectory)
+    count, experts = jax.tree.leaves(others)[0].shape[:2]
+    tracks = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), others.trajectory)
+    held = reference.features(scene, mine, np.repeat(np.arange(count), experts), tracks)
+    return {name: x.reshape(count, experts, *x.shape[1:]) for name, x in held.items()}

@@ -5,23 +5,41 @@ agent drives each episode several times, under as many types, so do other expert
 such group against the first is the floor. Of recorded episodes there is one expert each.
 """
 
+import functools
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import random
-from jaxtyping import Array
+from jaxtyping import Array, Int
 
 from rtc_mjx import cache, dataset
-from rtc_mjx.keys import stream
+from rtc_mjx.keys import folded, stream
 from rtc_mjx.pytree import in_parts
 from rtc_mjx.scenes import Features, Scene
-from rtc_mjx.trajectory import Demonstration
-
-AT_ONCE = 1024  # trajectories simulated at once
+from rtc_mjx.trajectory import Demonstration, Trajectory
 
 
 def expert_features(scene: Scene, test: Demonstration) -> Features:
     """Features of the test demonstrations; leading axis of episodes."""
-    return jax.device_get(jax.jit(jax.vmap(lambda held: scene.features(held, held.trajectory)))(dataset.without_truth(test)))
+    return features(scene, test, np.arange(len(jax.tree.leaves(test)[0])), test.trajectory)
+
+
+def features(scene: Scene, mine: Demonstration, rows: Int[np.ndarray, "tracks"], tracks: Trajectory) -> Features:
+    """Features of trajectories (leading axis), each in the episode of the demonstration that its row names."""
+    held = dataset.without_truth(mine)
+    return in_parts(lambda part: _described(scene, held, *part), (rows, tracks), dataset.AT_ONCE, fill=True)
+
+
+def _described(scene: Scene, mine: Demonstration, rows: np.ndarray, tracks: Trajectory) -> dict[str, Array]:
+    return describer(scene)(jax.tree.map(lambda x: x[rows], mine), tracks)
+
+
+@functools.lru_cache(maxsize=16)
+def describer(scene: Scene) -> Callable[[Demonstration, Trajectory], dict[str, Array]]:
+    """The scene's features of a vector of trajectories, compiled."""
+    return jax.jit(jax.vmap(scene.features))
 
 
 def experts(scene: Scene, count: int) -> Features:
@@ -65,14 +83,13 @@ def _of_others(scene: Scene, count: int) -> Features:
 
 def made(scene: Scene, mine: Demonstration, minds: int) -> Features:
     """Features of what so many other experts do in the episodes of test demonstrations: (episodes, minds, ...)."""
+    count = len(jax.tree.leaves(mine)[0])
 
-    def one(held: tuple[Demonstration, Array]) -> dict[str, Array]:
-        demonstration, key = held
+    def one_part(held: tuple[np.ndarray, Array]) -> dict[str, Array]:
+        rows, keys = held
+        driven = dataset.driver(scene)(jax.tree.map(lambda x: x[rows], mine.episode), keys)
+        return _described(scene, mine, rows, driven.trajectory)
 
-        def another(mind: Array) -> dict[str, Array]:
-            return scene.features(demonstration, dataset.driven(scene, demonstration.episode, random.fold_in(key, mind)).trajectory)
-
-        return jax.vmap(another)(jnp.arange(minds))
-
-    keys = random.split(stream("reference", 0), len(jax.tree.leaves(mine)[0]))
-    return in_parts(jax.jit(jax.vmap(one)), (mine, keys), max(1, AT_ONCE // minds))
+    keys = folded(random.split(stream("reference", 0), count), jnp.arange(minds))
+    held = in_parts(one_part, (np.repeat(np.arange(count), minds), keys), dataset.AT_ONCE, fill=True)
+    return {name: x.reshape(count, minds, *x.shape[1:]) for name, x in held.items()}

@@ -1,4 +1,4 @@
-"""What types carry, and what that costs: `python -m rtc_mjx.type_shift --run DIR` (method notes, section 7).
+"""What types carry, and what that costs: `python -m rtc_mjx.type_shift --run DIR`.
 
     test episodes, each also driven by other experts -> rollouts under the prior's types and those read off a trajectory: an episode's own,
     another expert's in the same episode, another episode's -> conditional shift is what the last costs beyond the one before
@@ -125,7 +125,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = cli.Parser(prog="python -m rtc_mjx.type_shift", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", type=Path, required=True, metavar="DIR", help="the run directory; its last checkpoint is analysed")
     parser.add_argument("--episodes", type=int, metavar="N", help="test episodes (default: experts.test of the run)")
-    parser.add_argument("--experts", type=int, default=32, metavar="M", help="experts, and rollouts, of an episode in conditional realism")
+    parser.add_argument(
+        "--experts", type=int, default=32, metavar="M", help="experts, and rollouts, of an episode in conditional realism (default: 32)"
+    )
     parser.add_argument("--probe", type=int, default=4096, metavar="P", help="fresh demonstrations for the probes (default: 4096)")
     options = parser.parse_args(argv)
     run = Run.open(options.run)

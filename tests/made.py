@@ -6,9 +6,8 @@ from pathlib import Path
 
 import jax
 import pytest
-from jax import random
 
-from rtc_mjx import dataset
+from rtc_mjx import dataset, reference
 from rtc_mjx.scenes import SCENES
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"  # real recordings; they are not part of the project
@@ -33,6 +32,5 @@ def demonstrated(name, count=512):
     """Demonstrations and their features, in single precision whatever the test's."""
     scene = made(name)
     with jax.enable_x64(False):
-        held = jax.jit(jax.vmap(lambda key: dataset.demonstrate(scene, key)))(random.split(random.key(5), count))
-        features = jax.jit(jax.vmap(lambda one: scene.features(one, one.trajectory)))(dataset.without_truth(held))
-        return jax.device_get(held), jax.device_get(features)
+        held = dataset.drive(scene, *dataset.begun(scene, count, 5))
+        return held, reference.expert_features(scene, held)

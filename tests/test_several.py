@@ -172,7 +172,7 @@ def settings(folder, **changes):
 def test_a_training_of_two_cars_goes_on_to_the_same_numbers_and_is_tested_and_filmed(tmp_path):
     held = settings(tmp_path / "run")
     run, scene = Run.create(held), held.scene
-    expert = jax.device_get(jax.jit(jax.vmap(lambda key: dataset.demonstrate(scene, key)))(random.split(random.key(0), held.experts.train)))
+    expert = dataset.demonstrations(scene, held.experts.train, dataset.TRAIN)
     learner, data = held.learner(dataset.statistics(scene, expert)), dataset.without_truth(expert)
     chunk = compiled_chunk(learner, 1)
     once, told = chunk(start_all(learner, held.all_seeds), data)
@@ -211,8 +211,8 @@ def test_every_kind_of_method_takes_several_agents(method):
 def test_several_experts_arrive_without_accident():
     """As one expert does; they take the routes that they have in mind, each its own, and Symphony's labels say so."""
     scene = Intersection(road_users=2, controlled=2)
-    held = jax.jit(jax.vmap(lambda key: dataset.demonstrate(scene, key)))(random.split(random.key(5), 256))
-    features = jax.jit(jax.vmap(lambda one: scene.features(one, one.trajectory)))(dataset.without_truth(held))
+    held = dataset.demonstrations(scene, 256, 5)
+    features = reference.expert_features(scene, held)
     assert features["collision"].shape == (256, 2)
     assert np.mean(features["collision"]) <= 0.02 and np.mean(features["offroad"]) < 0.01 and np.mean(features["ran_red"]) < 0.02
     assert np.all(np.mean(features["progress"], axis=0) > 15)

@@ -1,4 +1,4 @@
-"""What one car's trajectory says of how it was driven: the features that driving's metrics compare (method notes, section 6)."""
+"""What one car's trajectory says of how it was driven: the features that driving's metrics compare."""
 
 import jax
 import jax.numpy as jnp

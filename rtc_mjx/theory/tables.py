@@ -104,7 +104,7 @@ def conditional(joint: Float[Array, "*given asked"]) -> Float[Array, "*given ask
 
 
 def conditional_shift(state_type: Float[Array, "states types"]) -> Float[Array, ""]:
-    """E_s KL[q(g|s) || q(g)] = I(G; S), in nats: what shuffling types costs (method notes, section 7)."""
+    """E_s KL[q(g|s) || q(g)] = I(G; S), in nats: what shuffling types costs."""
     return mutual_information(state_type)
 
 

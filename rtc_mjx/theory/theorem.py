@@ -137,7 +137,7 @@ def fano(epsilon: Float[Array, ""] | float, actions: int) -> Float[Array, ""]:
 
 
 def counterexample() -> Instance:
-    """The claim holds, its last step does not (method notes, section 7). Found by search; q(s,g) was rounded and sums to 1.0001."""
+    """The claim holds, its last step does not. Found by search; q(s,g) was rounded and sums to 1.0001."""
     choice = jnp.array([[1, 2], [2, 2], [0, 2]])
     types = jnp.array([[0.0811, 0.1526], [0.0131, 0.6218], [0.0413, 0.0902]])
     return Instance(types / jnp.sum(types), jnp.eye(3)[choice])
