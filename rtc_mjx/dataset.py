@@ -14,7 +14,7 @@ from rtc_mjx import cache
 from rtc_mjx.errors import UsageError
 from rtc_mjx.keys import folded, stream
 from rtc_mjx.models import Statistics
-from rtc_mjx.pytree import in_parts
+from rtc_mjx.pytree import Watch, in_parts
 from rtc_mjx.rollout import rollout
 from rtc_mjx.scenes import Scene
 from rtc_mjx.trajectory import Demonstration, Episode
@@ -36,30 +36,31 @@ def driven(scene: Scene, episode: Episode, key: jax.Array) -> Demonstration:
     return Demonstration(episode, rollout(scene, actor, episode), truth)
 
 
-def demonstrations(scene: Scene, count: int, seed: int) -> Demonstration:
+def demonstrations(scene: Scene, count: int, seed: int, watch: Watch = iter) -> Demonstration:
     """Demonstrations with a leading axis of `count`, as numpy arrays; made on first use, then read from the cache.
 
     Args:
         scene: the scene and its settings.
         count: how many; of recorded scenes all, if there are fewer.
         seed: demonstrations of different seeds are independent. Recordings have two parts: TEST is one of them, all else the other.
+        watch: goes through the parts of the work, such as a progress bar; where there is none to do it is not called.
     """
     episodes = scene.recorded("test" if seed == TEST else "train", count)
     if episodes is not None:
-        return _replayed(scene, episodes)
-    shapes = jax.eval_shape(jax.vmap(lambda key: demonstrate(scene, key)), _keys(count, seed))
+        return _replayed(scene, episodes, watch)
+    shapes = _shapes(scene)
     file = cache.folder() / "demonstrations" / f"{scene.name}-{fingerprint(scene, count, seed)}.npz"
-    leaves = _fitting(cache.read_arrays(file), jax.tree.leaves(shapes))
+    leaves = _fitting(cache.read_arrays(file), count, jax.tree.leaves(shapes))
     if leaves is None:
-        leaves = jax.tree.leaves(drive(scene, *begun(scene, count, seed)))
+        leaves = jax.tree.leaves(drive(scene, *begun(scene, count, seed), watch))
         cache.write_arrays(file, {str(i): x for i, x in enumerate(leaves)})
     return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
 
 
-def _replayed(scene: Scene, episodes: Episode) -> Demonstration:
+def _replayed(scene: Scene, episodes: Episode, watch: Watch) -> Demonstration:
     """Recorded episodes driven by their logged experts, as numpy arrays."""
     count = len(jax.tree.leaves(episodes)[0])
-    return drive(scene, episodes, jax.vmap(jax.random.key)(np.zeros(count, int)))  # a logged expert draws nothing
+    return drive(scene, episodes, jax.vmap(jax.random.key)(np.zeros(count, int)), watch)  # a logged expert draws nothing
 
 
 def begun(scene: Scene, count: int, seed: int) -> tuple[Episode, jax.Array]:
@@ -68,9 +69,9 @@ def begun(scene: Scene, count: int, seed: int) -> tuple[Episode, jax.Array]:
     return in_parts(_resetter(scene), outside, AT_ONCE, fill=True), inside
 
 
-def drive(scene: Scene, episodes: Episode, minds: jax.Array) -> Demonstration:
-    """Episodes (leading axis) driven by experts, each with a mind drawn by a key, as numpy arrays."""
-    return in_parts(lambda held: driver(scene)(*held), (episodes, minds), AT_ONCE, fill=True)
+def drive(scene: Scene, episodes: Episode, minds: jax.Array, watch: Watch = iter) -> Demonstration:
+    """Episodes (leading axis) driven by experts, each with a mind drawn by a key, as numpy arrays; `watch` goes through the parts."""
+    return in_parts(lambda held: driver(scene)(*held), (episodes, minds), AT_ONCE, watch, fill=True)
 
 
 @functools.lru_cache(maxsize=16)
@@ -82,6 +83,12 @@ def driver(scene: Scene) -> Callable[[Episode, jax.Array], Demonstration]:
 @functools.lru_cache(maxsize=16)
 def _resetter(scene: Scene) -> Callable[[jax.Array], Episode]:
     return jax.jit(jax.vmap(scene.reset))
+
+
+def _shapes(scene: Scene) -> Demonstration:
+    """Shapes and types of AT_ONCE demonstrations; tracing them is what compiling them begins with."""
+    keys = jax.eval_shape(lambda: _keys(AT_ONCE, 0))
+    return jax.eval_shape(driver(scene), jax.eval_shape(_resetter(scene), keys), keys)
 
 
 def _keys(count: int, seed: int) -> jax.Array:
@@ -159,8 +166,10 @@ def without_truth(demonstrations: Demonstration) -> Demonstration:
     return Demonstration(episode, trajectory, ())
 
 
-def _fitting(arrays: dict[str, np.ndarray] | None, shapes: list[jax.ShapeDtypeStruct]) -> list[np.ndarray] | None:
-    """The leaves that a cache file holds; None where they do not fit (they are then made again)."""
+def _fitting(arrays: dict[str, np.ndarray] | None, count: int, shapes: list[jax.ShapeDtypeStruct]) -> list[np.ndarray] | None:
+    """The leaves that a cache file holds of so many demonstrations; None where they do not fit (they are then made again)."""
     leaves = [] if arrays is None else [arrays[str(i)] for i in range(len(shapes)) if str(i) in arrays]
-    fits = len(leaves) == len(shapes) and all(x.shape == s.shape and x.dtype == s.dtype for x, s in zip(leaves, shapes, strict=True))
+    fits = len(leaves) == len(shapes) and all(
+        x.shape == (count, *s.shape[1:]) and x.dtype == s.dtype for x, s in zip(leaves, shapes, strict=True)
+    )
     return leaves if fits else None

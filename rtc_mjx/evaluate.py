@@ -32,7 +32,7 @@ from rtc_mjx.learner import Learner
 from rtc_mjx.methods import Method
 from rtc_mjx.models import Networks
 from rtc_mjx.provenance import made_by, of_recordings
-from rtc_mjx.pytree import in_parts
+from rtc_mjx.pytree import Watch, in_parts
 from rtc_mjx.recorded_realism import challenge
 from rtc_mjx.runs import Run
 from rtc_mjx.scenes import Features, Recorded, Scene
@@ -47,7 +47,6 @@ FINITE = "finite"  # the feature that says whether a rollout is
 
 Donors = dict[str, Trajectory]  # the trajectory that each episode's type is inferred from, by source of types
 Roll = Callable[[Networks, Demonstration, Donors, Array], dict[str, Features]]
-Watch = Callable[[Sequence[Any]], Iterable[Any]]
 RollTrained = Callable[[Demonstration, Donors, Array], dict[str, Features]]
 
 

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 T = TypeVar("T")
+Watch = Callable[[Sequence[Any]], Iterable[Any]]
 
 
 @dataclass_transform(frozen_default=True)
@@ -33,9 +34,7 @@ def pytree(cls: type[T]) -> type[T]:
     return frozen
 
 
-def in_parts(
-    function: Callable[[Any], Any], tree: Any, at_once: int, watch: Callable[[Sequence[Any]], Iterable[Any]] = iter, fill: bool = False
-) -> Any:
+def in_parts(function: Callable[[Any], Any], tree: Any, at_once: int, watch: Watch = iter, fill: bool = False) -> Any:
     """A compiled function of a tree's leading axis, as numpy arrays: so many rows at once as memory allows.
 
     All parts are of one shape, so that one program does; rows that fill up the last part are cut off again.

@@ -93,7 +93,8 @@ def learn(run: Run, config: Config, grid: Grid, team: Team) -> None:
         KeyboardInterrupt: interrupted; a checkpoint was saved first.
     """
     announce(run, team, "demonstrations")
-    expert = dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN)
+    watch = evaluate.progress("demonstrations") if team.leads else iter
+    expert = dataset.demonstrations(config.scene, config.experts.train, dataset.TRAIN, watch)
     learner = config.learner(dataset.statistics(config.scene, expert))
     state, update, before = begin_together(run, learner, config, team)
     if update < config.updates:

@@ -28,6 +28,7 @@ from rtc_mjx.files import write_whole
 from rtc_mjx.keys import stream
 from rtc_mjx.probe import ProbeOptions
 from rtc_mjx.provenance import made_by
+from rtc_mjx.pytree import Watch
 from rtc_mjx.realism import realism
 from rtc_mjx.runs import Run
 from rtc_mjx.trained import Trained, trained
@@ -36,7 +37,7 @@ from rtc_mjx.trajectory import Demonstration
 FILE = "type_shift.json"
 LEAST_TESTS = 4
 PROBE = ProbeOptions()
-Progress = Callable[[str], evaluate.Watch]
+Progress = Callable[[str], Watch]
 
 
 def analyse(run: Run, episodes: int, experts: int, probed: int, progress: Progress = lambda what: iter) -> dict[str, Any]:
@@ -80,7 +81,7 @@ def analyse(run: Run, episodes: int, experts: int, probed: int, progress: Progre
     return out | of_types(held, test, progress("types")) | _probed(held, probed, out["left_out"])
 
 
-def of_types(held: Trained, test: Demonstration, watch: evaluate.Watch) -> dict[str, Any]:
+def of_types(held: Trained, test: Demonstration, watch: Watch) -> dict[str, Any]:
     """Rollouts per source of types, 'prior', 'paired', 'same_xi' and 'shuffled', and what they are made to tell."""
     scene, learner, key = held.config.scene, held.learner, stream("type shift", 0)
     given, roll = evaluate.donors(scene, learner.method, test), evaluate.roller(learner, scene.samples, watch)

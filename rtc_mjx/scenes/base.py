@@ -9,7 +9,7 @@ import abc
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from rtc_mjx.trajectory import Demonstration, Episode, Trajectory
 
 Features = dict[str, np.ndarray]  # of a population of trajectories, by name, with leading axes as `Scene.metrics` says
 Ranges = dict[str, tuple[float, float]]
+F = TypeVar("F", bound=Callable[..., Any])
 Act = Callable[[Any, Array, Any], tuple[Any, Array]]  # (memory, observation, noise of one step) -> (memory, action)
 
 
@@ -40,6 +41,11 @@ class Actor:
     memory: Any
     act: Act
     noise: Any
+
+
+def compiled(method: F) -> F:
+    """A pure method of a scene as one program, also where nothing around it is compiled: hundreds of small ones take a minute."""
+    return cast(F, functools.partial(jax.jit, static_argnums=0)(method))
 
 
 @dataclass(frozen=True)

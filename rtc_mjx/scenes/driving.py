@@ -29,7 +29,7 @@ from rtc_mjx.physics import PhysicsState, Surroundings, World, load, rest_state,
 from rtc_mjx.physics.car import CAR, CONTROL_UNIT
 from rtc_mjx.pytree import pytree
 from rtc_mjx.scenes import scenery
-from rtc_mjx.scenes.base import Features, ItemSet, Ranges, Scene
+from rtc_mjx.scenes.base import Features, ItemSet, Ranges, Scene, compiled
 from rtc_mjx.scenes.conduct import conduct, manoeuvre, on_branches, span
 from rtc_mjx.scenes.routes import SPACING, RouteOptions, Routes, find_routes
 from rtc_mjx.scenes.several import cars_apart, cars_together, the_others
@@ -212,6 +212,7 @@ class Driving(Scene):
         """The episode of a logged scene."""
         return self.episode(self.log(key))
 
+    @compiled
     def episode(self, log: LoggedScene) -> Episode:
         """The agents where and as fast as they were logged at t = 0, the nearest road users as they were logged."""
         log, times = with_room_for(log, self.road_users), CONTROL_EVERY * jnp.arange(self.steps + 1)
@@ -311,6 +312,7 @@ class Driving(Scene):
         off = jnp.sqrt(jnp.sum((here - there)[1:] ** 2, axis=-1) + 1e-6)
         return jnp.mean(jnp.where(off < 1, 0.5 * off**2, off - 0.5))
 
+    @compiled
     def features(self, demonstration: Demonstration, trajectory: Trajectory) -> dict[str, Array]:
         """Of each car: collisions, time off the road, distance from the expert, turn, progress, curvature where lanes branch, reds."""
         episode = demonstration.episode

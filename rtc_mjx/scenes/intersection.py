@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int
 from rtc_mjx.geometry import resample, rotate
 from rtc_mjx.logs import AMBER, GREEN, NO_SIGNAL, PEDESTRIAN, RATE, RED, VEHICLE, LoggedScene, RoadGraph
 from rtc_mjx.physics.car import CAR
+from rtc_mjx.scenes.base import compiled
 from rtc_mjx.scenes.generated import Generated, Traffic, assemble, moving
 from rtc_mjx.scenes.roads import POINTS, arc, ring_edges, straight, thinned
 from rtc_mjx.scenes.traffic import Drivers, Walkers, drive, walk
@@ -62,6 +63,7 @@ class Intersection(Generated):
         routes = dataclasses.replace(road.routes, signals=turned(road.routes.signals))
         return dataclasses.replace(episode, context=dataclasses.replace(road, signals=turned(road.signals), routes=routes))
 
+    @compiled
     def log(self, key: jax.Array) -> LoggedScene:
         """Road, signals, traffic; the agent itself at t = 0 only."""
         shape, lights, who, own = random.split(key, 4)

@@ -15,6 +15,7 @@ from jaxtyping import Array
 from rtc_mjx.geometry import resample
 from rtc_mjx.logs import NO_SIGNAL, VEHICLE, LoggedScene, RoadGraph
 from rtc_mjx.physics.car import CAR
+from rtc_mjx.scenes.base import compiled
 from rtc_mjx.scenes.generated import Generated, Traffic, assemble, moving
 from rtc_mjx.scenes.joining import Joint
 from rtc_mjx.scenes.roads import POINTS, as_segments, beside, bezier, straight, thinned
@@ -48,6 +49,7 @@ class Merge(Generated):
     settings: ClassVar[str] = "intersection"
     route_options: ClassVar[RouteOptions] = RouteOptions(count=2, lanes=4)
 
+    @compiled
     def log(self, key: jax.Array) -> LoggedScene:
         """Road and traffic; the agent itself at t = 0 only."""
         shape, who, place, pace = random.split(key, 4)

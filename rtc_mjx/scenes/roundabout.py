@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from rtc_mjx.geometry import resample, rotate
 from rtc_mjx.logs import NO_SIGNAL, RED, VEHICLE, LoggedScene, RoadGraph
 from rtc_mjx.physics.car import CAR
+from rtc_mjx.scenes.base import compiled
 from rtc_mjx.scenes.generated import Generated, Traffic, assemble, moving
 from rtc_mjx.scenes.joining import Joint
 from rtc_mjx.scenes.roads import arc, as_segments, beside, bezier, straight, thinned
@@ -59,6 +60,7 @@ class Roundabout(Generated):
     settings: ClassVar[str] = "intersection"
     route_options: ClassVar[RouteOptions] = RouteOptions(lanes=9)
 
+    @compiled
     def log(self, key: jax.Array) -> LoggedScene:
         """Road and traffic; the agent itself at t = 0 only."""
         shape, who, place, pace = random.split(key, 4)
