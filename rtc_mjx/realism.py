@@ -121,6 +121,6 @@ def _interval(episodes: Float[np.ndarray, "episodes"]) -> list[float]:
 def _described(scene: Scene, mine: Demonstration, others: Demonstration) -> Features:
     """Features of other experts' trajectories in the episodes of demonstrations: (episodes, experts)."""
     count, experts = jax.tree.leaves(others)[0].shape[:2]
-    tracks = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), others.trajectory)
+    tracks = jax.tree.map(lambda x: x.reshape(count * experts, *x.shape[2:]), others.trajectory)
     held = reference.features(scene, mine, np.repeat(np.arange(count), experts), tracks)
     return {name: x.reshape(count, experts, *x.shape[1:]) for name, x in held.items()}
