@@ -314,5 +314,7 @@ def _rows(axis: Axes, names: Sequence[str]) -> None:
     """A row for each name, the first at the top."""
     axis.set_yticks(range(len(names)), names, fontsize=8)
     axis.tick_params(axis="x", labelsize=7)
+    if axis.get_xscale() == "linear":
+        axis.locator_params(axis="x", nbins=5)  # long numbers would run into each other
     axis.grid(alpha=0.25, axis="x")
     axis.set_ylim(len(names) - 0.4, -0.6)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from rtc_mjx import dataset
+from rtc_mjx import gradients as updating
 from rtc_mjx.config import Config, Experts, Intervals
 from rtc_mjx.learner import Learner, OptimiserOptions
 from rtc_mjx.losses import LossWeights
@@ -51,8 +52,24 @@ def learner(method, *, weights=None, optimiser=OPEN, share=0.5, batch=12):
 
 def begin(learner, seed=0):
     """A fresh state, in the precision at hand, and a minibatch."""
-    state = start(learner, jnp.array(seed))
+    state = jax.jit(functools.partial(start, learner))(jnp.array(seed))
     demonstrations = experts(jnp.zeros(0).dtype == jnp.float64)
     batch = jax.tree.map(lambda x: x[: learner.batch], dataset.without_truth(demonstrations))
     wide = jax.tree.map(lambda x: x.astype(jnp.zeros(0).dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, state)
     return wide, batch
+
+
+def gradients(learner, networks, batch, key, update):
+    """What an update follows, as one program: by itself it is hundreds."""
+    return jax.jit(functools.partial(updating.gradients, learner))(networks, batch, key, update)
+
+
+def played(learner, networks, batch, types, key):
+    """Types of each branch, drawn with one key, and the rollouts of those that are played, with another: as one program."""
+
+    def both(networks):
+        agent = learner.agent(networks)
+        typed = updating.infer(learner, agent, batch, types)
+        return typed, updating.play_together(learner, agent, batch, typed, key)[0]
+
+    return jax.jit(both)(networks)

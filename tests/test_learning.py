@@ -10,12 +10,12 @@ import pytest
 from flax import nnx
 from jax import random
 from jax.test_util import check_grads
-from learning import CLOSED_LOOP, ON_SCENE, SCENE, SCORED, begin, experts, learner
+from learning import CLOSED_LOOP, ON_SCENE, SCENE, SCORED, begin, experts, gradients, learner, played
 
 from rtc_mjx import gradients as learning
 from rtc_mjx.agent_types import SOURCES
 from rtc_mjx.config import unread
-from rtc_mjx.gradients import Played, gradients
+from rtc_mjx.gradients import Played
 from rtc_mjx.losses import LOSSES, Case, LossWeights
 from rtc_mjx.methods import METHODS
 from rtc_mjx.models import Networks
@@ -41,9 +41,9 @@ def plain_loss(held, networks, batch, key):
     types, play, extra, glance = random.split(key, 4)
     agent = held.agent(networks)
     typed = learning.infer(held, agent, batch, types)
-    played = plain_rollouts(held, agent, batch, typed, play)
-    lost = learning.branch_losses(held, agent, batch, typed, played, extra, frozenset(LOSSES))
-    critic = learning.critic_loss(held, agent, batch, played, glance)[0] if played else 0.0
+    rollouts = plain_rollouts(held, agent, batch, typed, play)
+    lost = learning.branch_losses(held, agent, batch, typed, rollouts, extra, frozenset(LOSSES))
+    critic = learning.critic_loss(held, agent, batch, rollouts, glance)[0] if rollouts else 0.0
     return held.weights.total(lost, jnp.array(0)) + critic
 
 
@@ -91,8 +91,8 @@ def test_gradient_through_rollouts_matches_differences(x64):
 def _critic(held, state, batch, policy):
     agent = held.agent(dataclasses.replace(state.networks, policy=policy))
     types, play, _, glance = random.split(random.key(3), 4)
-    played, _ = learning.play_together(held, agent, batch, learning.infer(held, agent, batch, types), play)
-    return float(learning.critic_loss(held, agent, batch, played, glance)[0])
+    _, rollouts = played(held, agent.networks, batch, types, play)
+    return float(learning.critic_loss(held, agent, batch, rollouts, glance)[0])
 
 
 @pytest.mark.parametrize("method", ["rtc_c", "rtc_d"])
@@ -109,13 +109,13 @@ def test_rollouts_of_both_branches_are_fakes_for_the_discriminator(method):
     held = learner(method)
     state, batch = begin(held)
     agent = held.agent(state.networks)
-    played, _ = learning.play_together(held, agent, batch, learning.infer(held, agent, batch, random.key(1)), random.key(2))
-    assert len(played.alive) == held.batch
+    _, rollouts = played(held, state.networks, batch, random.key(1), random.key(2))
+    assert len(rollouts.alive) == held.batch
     first, second = (
-        learning.critic_loss(held, agent, batch, Played(played.tracks, played.alive & rows), random.key(3))[0]
+        learning.critic_loss(held, agent, batch, Played(rollouts.tracks, rollouts.alive & rows), random.key(3))[0]
         for rows in (jnp.arange(held.batch) < held.batch // 2, jnp.arange(held.batch) >= held.batch // 2)
     )
-    both = learning.critic_loss(held, agent, batch, played, random.key(3))[0]
+    both = learning.critic_loss(held, agent, batch, rollouts, random.key(3))[0]
     assert both == pytest.approx(float(first + second) / 2, rel=1e-5) and abs(float(first - second)) > 1e-6
 
 
@@ -137,8 +137,7 @@ def test_only_rollouts_under_types_as_at_test_time_are_fakes_where_told_so(metho
     told = dataclasses.replace(told, scene=scene)
     state, batch = begin(told)
     agent = told.agent(state.networks)
-    typed = learning.infer(told, agent, batch, random.key(1))
-    played, _ = learning.play_together(held, agent, batch, typed, random.key(2))
+    typed, rollouts = played(held, state.networks, batch, random.key(1), random.key(2))
     rtc, split = method.startswith("rtc"), 3
     assert (told.faking != held.faking) == rtc == ("losses.fakes" not in unread(method))
     if not rtc:
@@ -146,9 +145,9 @@ def test_only_rollouts_under_types_as_at_test_time_are_fakes_where_told_so(metho
             held.losses(b) for b in held.closed_loop
         ]
         return
-    fakes = Played(jax.tree.map(lambda x: x[split:], played.tracks), played.alive[split:])
-    masked = Played(played.tracks, played.alive & (jnp.arange(told.batch) >= split))
-    mine = played if scene.reconstructs_rollouts else fakes
+    fakes = Played(jax.tree.map(lambda x: x[split:], rollouts.tracks), rollouts.alive[split:])
+    masked = Played(rollouts.tracks, rollouts.alive & (jnp.arange(told.batch) >= split))
+    mine = rollouts if scene.reconstructs_rollouts else fakes
     (ours, _), (theirs, _) = (learning.critic_loss(x, agent, batch, y, random.key(3)) for x, y in ((told, mine), (held, masked)))
     assert float(ours) == pytest.approx(float(theirs), rel=1e-6)
     lost = learning.branch_losses(told, agent, batch, typed, mine, random.key(4), frozenset(LOSSES))
@@ -173,12 +172,12 @@ def test_discriminator_is_kept_smooth_where_experts_are_and_where_agents_are(x64
     held = learner("rtc_c")
     state, batch = begin(held)
     agent = held.agent(state.networks)
-    played, _ = learning.play_together(held, agent, batch, learning.infer(held, agent, batch, random.key(1)), random.key(2))
-    played = dataclasses.replace(played, alive=played.alive.at[3].set(False))
+    _, rollouts = played(held, state.networks, batch, random.key(1), random.key(2))
+    rollouts = dataclasses.replace(rollouts, alive=rollouts.alive.at[3].set(False))
 
     def loss(networks, **weights):
         other = dataclasses.replace(held, weights=dataclasses.replace(held.weights, **weights))
-        return learning.critic_loss(other, held.agent(networks), batch, played, random.key(3))[0]
+        return learning.critic_loss(other, held.agent(networks), batch, rollouts, random.key(3))[0]
 
     def slopes(tracks):
         slope = jax.grad(lambda x: agent.networks.discriminator(x)[0])
@@ -187,7 +186,7 @@ def test_discriminator_is_kept_smooth_where_experts_are_and_where_agents_are(x64
 
     bare = {"discriminator_penalty": 0.0, "discriminator_penalty_agent": 0.0}
     rest = loss(state.networks, **bare)
-    on_experts, on_agents = jnp.mean(slopes(batch.trajectory)), jnp.mean(slopes(played.tracks)[played.alive])
+    on_experts, on_agents = jnp.mean(slopes(batch.trajectory)), jnp.mean(slopes(rollouts.tracks)[rollouts.alive])
     assert loss(state.networks, **bare | {"discriminator_penalty": 0.5}) - rest == pytest.approx(0.5 * float(on_experts), rel=1e-9)
     assert loss(state.networks, **bare | {"discriminator_penalty_agent": 0.5}) - rest == pytest.approx(0.5 * float(on_agents), rel=1e-9)
     check_grads(lambda n: loss(n, discriminator_penalty_agent=0.5), (state.networks,), order=1, modes=("rev",), eps=1e-6)
@@ -205,15 +204,14 @@ def test_encoder_gets_no_gradient_from_the_prior_branch(method):
 def test_discriminator_gets_no_gradient_from_what_the_policy_loses(method):
     held = learner(method)
     state, batch = begin(held)
-    agent_types = learning.infer(held, held.agent(state.networks), batch, random.key(1))
-    played, _ = learning.play_together(held, held.agent(state.networks), batch, agent_types, random.key(2))
+    _, rollouts = played(held, state.networks, batch, random.key(1), random.key(2))
 
     def lost(networks):
         agent = held.agent(networks)
         typed = learning.infer(held, agent, batch, random.key(1))
-        return sum(learning.branch_losses(held, agent, batch, typed, played, random.key(3), frozenset(LOSSES)).values())
+        return sum(learning.branch_losses(held, agent, batch, typed, rollouts, random.key(3), frozenset(LOSSES)).values())
 
-    assert size(jax.grad(lost)(state.networks).discriminator) == 0
+    assert size(jax.jit(jax.grad(lost))(state.networks).discriminator) == 0
 
 
 @pytest.mark.parametrize("method", [name for name in CLOSED_LOOP if name not in SCORED])
@@ -225,7 +223,7 @@ def test_a_step_down_the_adversarial_loss_raises_the_experts_probability(method,
     def probability(networks):
         agent = held.agent(dataclasses.replace(networks, discriminator=state.networks.discriminator))
         types, play, _, _ = random.split(random.key(0), 4)
-        tracks = learning.play_together(held, agent, batch, learning.infer(held, agent, batch, types), play)[0].tracks
+        tracks = played(held, agent.networks, batch, types, play)[1].tracks
         return float(jnp.mean(jax.nn.sigmoid(jax.vmap(agent.logit)(tracks.observations[:, :-1], tracks.actions))))
 
     stepped = jax.tree.map(lambda x, g: x - 0.05 * g / (1e-9 + size(gradient.policy)), state.networks, gradient)
@@ -316,7 +314,7 @@ def test_gradient_modes_cut_what_they_say(x64):
         def last(nudge):
             return rollout(SCENE, agent.actor(jnp.zeros(0), random.key(0), nudge), one.episode, **options).states.qpos[-1, 0]
 
-        return np.asarray(jax.grad(last)(jnp.zeros((SCENE.steps, agent.outputs))))
+        return np.asarray(jax.jit(jax.grad(last))(jnp.zeros((SCENE.steps, agent.outputs))))
 
     full, physics, nothing = (slope(gradient=mode) for mode in ("full", "dynamics_only", "none"))
     assert np.abs(nothing[:-1]).max() == 0 and np.abs(nothing[-1]).max() > 0
