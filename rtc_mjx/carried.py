@@ -19,6 +19,7 @@ from rtc_mjx.agent_types import READINGS, SOURCES
 from rtc_mjx.keys import stream
 from rtc_mjx.models import Agent, Networks
 from rtc_mjx.probe import ProbeOptions, information, noisy_copy
+from rtc_mjx.pytree import stacked
 from rtc_mjx.scenes import Scene, merged
 from rtc_mjx.trained import Trained
 from rtc_mjx.trajectory import Demonstration, Trajectory
@@ -133,8 +134,7 @@ def reencoding(held: Trained, test: Demonstration) -> dict[str, list[float]]:
             g = typed(place)
             return told(place, learner.play(agent, place.episode, g, scene.key_each(noise)), g)
 
-        places = jax.tree.map(lambda *x: jnp.stack(x), mine, elsewhere)
-        here, there = lax.map(rollout, places)  # in turn: the simulation is compiled once
+        here, there = lax.map(rollout, stacked((mine, elsewhere)))  # in turn: the simulation is compiled once
         return {"demonstration": told(mine, mine.trajectory, typed(mine)), "rollout": here, "rollout_elsewhere": there}
 
     other = evaluate.elsewhere(scene, test)

@@ -32,7 +32,7 @@ from rtc_mjx.learner import Learner
 from rtc_mjx.methods import Method
 from rtc_mjx.models import Networks
 from rtc_mjx.provenance import made_by, of_recordings
-from rtc_mjx.pytree import Watch, in_parts
+from rtc_mjx.pytree import Watch, in_parts, stacked
 from rtc_mjx.recorded_realism import challenge
 from rtc_mjx.runs import Run
 from rtc_mjx.scenes import Features, Recorded, Scene
@@ -97,7 +97,7 @@ def roller(learner: Learner, samples: int, watch: Watch = iter, grid: Grid = ONE
 
         types = learner.types(learner.method.test_types, agent, mine, draw).agent_type[None]
         if given:
-            types = jnp.concatenate([types, lax.map(read, _stacked(given.values()))])
+            types = jnp.concatenate([types, lax.map(read, stacked(given.values()))])
         features = lax.map(described, types)  # sources take turns in one loop: a copy of the simulation for each would be compiled
         return {name: jax.tree.map(lambda x, i=i: x[i], features) for i, name in enumerate(["prior", *given])}
 
@@ -126,11 +126,6 @@ def part_size(count: int, samples: int) -> int:
 def at_once() -> int:
     """How many rollouts are simulated at once."""
     return AT_ONCE.get(jax.default_backend(), MANY)
-
-
-def _stacked(trees: Iterable[Any]) -> Any:
-    """Trees of one structure as one, with a leading axis."""
-    return jax.tree.map(lambda *x: jnp.stack(x), *trees)
 
 
 def _finite(track: Trajectory) -> Array:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 T = TypeVar("T")
@@ -32,6 +33,11 @@ def pytree(cls: type[T]) -> type[T]:
 
     jax.tree_util.register_pytree_with_keys(frozen, flatten, unflatten)
     return frozen
+
+
+def stacked(trees: Iterable[Any]) -> Any:
+    """Trees of one structure as one, with a leading axis."""
+    return jax.tree.map(lambda *x: jnp.stack(x), *trees)
 
 
 def in_parts(function: Callable[[Any], Any], tree: Any, at_once: int, watch: Watch = iter, fill: bool = False) -> Any:
