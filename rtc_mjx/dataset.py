@@ -24,12 +24,6 @@ TRAIN, TEST, SECOND_TEST, PROBED = 0, 1, 2, 3
 AT_ONCE = 128  # episodes that experts drive at once, however many there are: one program does for all sets of a scene
 
 
-def demonstrate(scene: Scene, key: jax.Array) -> Demonstration:
-    """One episode driven by the scene's expert."""
-    outside, inside = jax.random.split(key)
-    return driven(scene, scene.reset(outside), inside)
-
-
 def driven(scene: Scene, episode: Episode, key: jax.Array) -> Demonstration:
     """An episode driven by an expert."""
     actor, truth = scene.expert(key, episode)

@@ -198,7 +198,8 @@ def test_a_training_of_two_cars_goes_on_to_the_same_numbers_and_is_tested_and_fi
 def test_every_kind_of_method_takes_several_agents(method):
     """Traced, not run: shapes fit, and every agent has a type."""
     held = settings(None, method=method)
-    expert = jax.eval_shape(jax.vmap(lambda key: dataset.demonstrate(held.scene, key)), random.split(random.key(0), held.batch))
+    keys = random.split(random.key(0), held.batch)
+    expert = jax.eval_shape(jax.vmap(lambda key: dataset.driven(held.scene, held.scene.reset(key), key)), keys)
     features = expert.trajectory.observations.shape[-1]
     zeros, ones = jnp.zeros(features), jnp.ones(features)
     learner = held.learner(dataset.Statistics(zeros, ones, jnp.zeros(2), jnp.ones(2)))

@@ -165,7 +165,7 @@ def metrics_of(name):
     scene = SCENES[name]()
 
     def one(key):
-        held = dataset.demonstrate(scene, key)
+        held = dataset.driven(scene, scene.reset(key), key)
         return scene.features(held, held.trajectory)
 
     features = {k: np.zeros((4, *x.shape), x.dtype) for k, x in jax.eval_shape(one, jax.random.key(0)).items()}
