@@ -136,9 +136,17 @@ UNTESTED = (
 
 
 def table(scene: str, held: Mapping[str, Record]) -> str:
-    """The paper's claims on a scene with what was measured, as Markdown; empty where none is about the scene."""
-    rows = [row(claim, held) for claim in CLAIMS if scene in claim.scenes]
-    return results.markdown([COLUMNS, *rows], left=len(COLUMNS)) + f"\n{CAPTION}\n\n{UNTESTED}\n" if rows else ""
+    """The paper's claims on a scene with what was measured, as Markdown; empty where none is about the scene.
+
+    Where all of them compare methods of which some was not run, as beside one method alone, a sentence that says so.
+    """
+    about = [claim for claim in CLAIMS if scene in claim.scenes]
+    if not about:
+        return ""
+    if results.finished(held) == held and not any(claim.names <= set(held) for claim in about):
+        told = f"The paper's {len(about)} claims on {scene} compare methods that are not all among these results"
+        return f"{told}: `python -m rtc_mjx.study --scene {scene}` runs them.\n"
+    return results.markdown([COLUMNS, *(row(claim, held) for claim in about)], left=len(COLUMNS)) + f"\n{CAPTION}\n\n{UNTESTED}\n"
 
 
 def everywhere(folder: Path) -> str:

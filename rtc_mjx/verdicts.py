@@ -127,6 +127,11 @@ class Claim:
     threshold: str = "-"
     why: str = "not known"
 
+    @property
+    def names(self) -> frozenset[str]:
+        """Of the results that it needs."""
+        return self.left.names | self.right.names
+
     def margin(self, held: Held) -> Seeds:
         """Of each seed, by how much it does what the claim says; below 0 where it does not.
 
@@ -156,10 +161,10 @@ def row(claim: Claim, held: Held) -> list[str]:
     """A claim's row: what was measured, and the verdict; or what there is no result of."""
     first = [claim.text, claim.where, claim.threshold]
     whole = results.finished(held)
-    if absent := sorted((claim.left.names | claim.right.names) - set(whole)):
+    if absent := sorted(claim.names - set(whole)):
         failed = [f"{name} {held[name]['failed'].partition(':')[0]}" if name in held else f"{name} was not run" for name in absent]
         return [*first, "; ".join(failed), "", "not tested", ""]
-    first_of, *others = [whole[name] for name in sorted(claim.left.names | claim.right.names)]
+    first_of, *others = [whole[name] for name in sorted(claim.names)]
     if not all(results.comparable(first_of, other) for other in others):
         return [*first, "tested on other recordings", "", "not tested", ""]
     try:
