@@ -1,6 +1,7 @@
 """Laws of the learning rule, on every method there is."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -236,8 +237,9 @@ def test_rtc_with_share_one_is_naive_hierarchy(kind):
     for name in (f"rtc_{kind}", f"naive_hierarchy_{kind}"):
         held = learner(name, share=1.0)
         state, _ = begin(held)
+        step = jax.jit(functools.partial(train_step, held))
         for _ in range(2):
-            state, _ = train_step(held, state, experts(False))
+            state, _ = step(state, experts(False))
         states.append(jax.tree.leaves(state.networks))
     assert all(np.array_equal(a, b) for a, b in zip(*states, strict=True))
 
@@ -248,7 +250,7 @@ def test_no_loss_of_the_policy_reads_the_experts_inner_truth():
     state, _ = begin(held)
     whole = experts(False)
     blind = dataclasses.replace(whole, truth=())
-    a, b = (train_step(held, state, data)[0] for data in (whole, blind))
+    a, b = (jax.jit(functools.partial(train_step, held))(state, data)[0] for data in (whole, blind))
     assert all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a.networks), jax.tree.leaves(b.networks), strict=True))
 
 
@@ -386,7 +388,7 @@ def test_networks_do_not_care_in_which_order_items_come():
     items = x[3:23].reshape(4, 5)
     turned = x.at[3:23].set(items[jnp.array([2, 0, 3, 1])].reshape(-1))
     for network in (Reader(layout, [8, 8], 6, nnx.Rngs(0)), Encoder(layout, 6, 8, 2, nnx.Rngs(0))):
-        read = (lambda v, n=network: n(v[None])) if isinstance(network, Encoder) else network
+        read = jax.jit((lambda v, n=network: n(v[None])) if isinstance(network, Encoder) else network.__call__)
         assert np.allclose(read(x), read(turned), atol=1e-6)
         assert not np.allclose(read(x), read(x.at[4].add(1.0)), atol=1e-4)
     scores = Scores(layout, 8, nnx.Rngs(0))
