@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rtc_mjx import over_seeds, results
 from rtc_mjx.results import Record
-from rtc_mjx.verdicts import LEAST_SEEDS, Claim, bits, constant, gained, lost, metric, null, row
+from rtc_mjx.verdicts import LEAST_SEEDS, NOT_TESTED, Claim, bits, constant, gained, lost, metric, null, row
 
 GOALS, DRIVING = ("double_goal",), ("intersection", "womd")
 V_A, V_B = "section V-A", "section V-B"
@@ -150,11 +150,18 @@ def table(scene: str, held: Mapping[str, Record]) -> str:
 
 
 def everywhere(folder: Path) -> str:
-    """The claims of all results in folders beside each other, results/*/*.json, as one table; empty where there are none."""
-    parts = []
+    """The claims of all results in folders beside each other, results/*/*.json, as one table; empty where there are none.
+
+    A claim that is tested in one folder is left out of others of the scene that do not test it, such as those of a few variations.
+    """
+    parts, tested = [], set()
     for place in sorted(folder.iterdir()) if folder.is_dir() else []:
         held = results.read(place) if place.is_dir() else {}
-        rows = [row(claim, held) for claim in CLAIMS if held and next(iter(held.values()))["scene"] in claim.scenes]
-        parts += [[place.name, *cells] for cells in rows]
+        scene = next(iter(held.values()))["scene"] if held else ""
+        for claim in (claim for claim in CLAIMS if scene in claim.scenes):
+            cells = row(claim, held)
+            parts.append((scene, claim.text, [place.name, *cells]))
+            tested |= {(scene, claim.text)} if NOT_TESTED not in cells else set()
+    told = [cells for scene, text, cells in parts if NOT_TESTED not in cells or (scene, text) not in tested]
     head = ("results", *COLUMNS)
-    return results.markdown([head, *parts], left=len(head)) + f"\n{CAPTION}\n\n{UNTESTED}\n" if parts else ""
+    return results.markdown([head, *told], left=len(head)) + f"\n{CAPTION}\n\n{UNTESTED}\n" if told else ""

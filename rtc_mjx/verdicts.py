@@ -17,6 +17,7 @@ from rtc_mjx.over_seeds import Seeds
 from rtc_mjx.results import Record
 
 LEAST_SEEDS = 4  # with fewer no verdict is given
+NOT_TESTED = "not tested"  # the verdict where a result is missing
 
 Held = Mapping[str, Record]
 Numbers = Seeds | float
@@ -163,16 +164,16 @@ def row(claim: Claim, held: Held) -> list[str]:
     whole = results.finished(held)
     if absent := sorted(claim.names - set(whole)):
         failed = [f"{name} {held[name]['failed'].partition(':')[0]}" if name in held else f"{name} was not run" for name in absent]
-        return [*first, "; ".join(failed), "", "not tested", ""]
+        return [*first, "; ".join(failed), "", NOT_TESTED, ""]
     first_of, *others = [whole[name] for name in sorted(claim.names)]
     if not all(results.comparable(first_of, other) for other in others):
-        return [*first, "tested on other recordings", "", "not tested", ""]
+        return [*first, "tested on other recordings", "", NOT_TESTED, ""]
     try:
         margin = claim.margin(whole)
     except KeyError as error:
-        return [*first, f"not measured ({error.args[0]})", "", "not tested", ""]
+        return [*first, f"not measured ({error.args[0]})", "", NOT_TESTED, ""]
     if not margin:
-        return [*first, "no seed in common", "", "not tested", ""]
+        return [*first, "no seed in common", "", NOT_TESTED, ""]
     said, p = verdict(margin)
     told = f"{_number(claim.left, whole)} {claim.relation} {_number(claim.right, whole)}; margin {over_seeds.signed(list(margin.values()))}"
     return [*first, told, f"{p:.3g}", said, claim.why if said.startswith(("no", "tie")) else ""]

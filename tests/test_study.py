@@ -214,6 +214,26 @@ def test_tables_name_what_differs_from_the_committed_settings_and_other_commits(
     assert "`python -m rtc_mjx.train --scene double_goal --method rtc_c --seeds 4 --first-seed 1`" in report.TABLES["table"](held, "few")
 
 
+def test_one_method_alone_is_told_that_claims_compare_several():
+    alone = {"mgail": record("mgail", prior={"return": [1.0] * 4, "jsd_goal": [0.1] * 4})}
+    text = claims.table("double_goal", alone)
+    assert "|" not in text and "python -m rtc_mjx.study --scene double_goal" in text
+    assert "diverged" in claims.table("double_goal", {**alone, "bc": {"failed": "diverged: at update 3", "scene": "double_goal"}})
+
+
+def test_a_claim_that_one_folder_tests_is_not_repeated_where_another_does_not(tmp_path):
+    values = {"return": [1.0, 1.1, 0.9, 1.0], "jsd_goal": [0.1] * 4}
+    for folder, methods in {"whole": ("bc", "mgail"), "few": ("mgail", "rtc_c")}.items():
+        for name in methods:
+            (tmp_path / folder).mkdir(exist_ok=True)
+            results.write(tmp_path / folder, name, record(name, prior=values) | {"curves": {}})
+    rows = [line.split(" | ") for line in claims.everywhere(tmp_path).splitlines() if line.startswith("|")]
+    where = {text: [cells[0].strip("| ") for cells in rows if cells[1] == text] for text in {cells[1] for cells in rows}}
+    assert where["MGAIL returns more than BC"] == ["whole"]
+    assert where["RTC returns at least what MGAIL does (continuous types)"] == ["few"]
+    assert where["RTC returns at least what MGAIL does (discrete types)"] == ["few", "whole"]  # nobody tests it: nothing is hidden
+
+
 def test_methods_tested_on_other_recordings_are_not_compared():
     held = {name: record(name, prior={"collision_rate": [0.1] * 4}) | {"scene": "womd"} for name in ("mgail", "rtc_c", "symphony")}
     for name in held:
