@@ -154,14 +154,12 @@ def everywhere(folder: Path) -> str:
 
     A claim that is tested in one folder is left out of others of the scene that do not test it, such as those of a few variations.
     """
-    parts, tested = [], set()
+    parts: list[tuple[str, str, list[str]]] = []
     for place in sorted(folder.iterdir()) if folder.is_dir() else []:
         held = results.read(place) if place.is_dir() else {}
         scene = next(iter(held.values()))["scene"] if held else ""
-        for claim in (claim for claim in CLAIMS if scene in claim.scenes):
-            cells = row(claim, held)
-            parts.append((scene, claim.text, [place.name, *cells]))
-            tested |= {(scene, claim.text)} if NOT_TESTED not in cells else set()
+        parts += [(scene, claim.text, [place.name, *row(claim, held)]) for claim in CLAIMS if scene in claim.scenes]
+    tested = {(scene, text) for scene, text, cells in parts if NOT_TESTED not in cells}
     told = [cells for scene, text, cells in parts if NOT_TESTED not in cells or (scene, text) not in tested]
     head = ("results", *COLUMNS)
     return results.markdown([head, *told], left=len(head)) + f"\n{CAPTION}\n\n{UNTESTED}\n" if told else ""
