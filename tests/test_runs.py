@@ -90,7 +90,7 @@ def test_ctrl_c_saves_a_checkpoint_first(tmp_path, monkeypatch):
 
 def test_killed_run_resumes_bit_for_bit(tmp_path):
     """SIGKILL at a moment of its own choosing; what was left behind goes on to the same numbers."""
-    command = [sys.executable, "-m", "rtc_mjx.train", "--method", "bc", *SMALL, "--every.save", "10", "--updates", "400"]
+    command = [sys.executable, "-m", "rtc_mjx.train", "--method", "bc", *SMALL, "--every.save", "10", "--every.test", "40", "--updates", "120"]
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     subprocess.run([*command, "--run", str(tmp_path / "a")], env=env, capture_output=True, check=True, timeout=300)
     with subprocess.Popen([*command, "--run", str(tmp_path / "b")], env=env, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as child:
@@ -98,6 +98,7 @@ def test_killed_run_resumes_bit_for_bit(tmp_path):
         while not any((tmp_path / "b" / "checkpoints").glob("[1-9]*")) and time.monotonic() < deadline:
             time.sleep(0.05)
         time.sleep(0.3)
+        assert child.poll() is None  # or it would have ended by itself
         child.kill()
     resumed = ["--run", str(tmp_path / "b"), "--resume"]
     done = subprocess.run([sys.executable, "-m", "rtc_mjx.train", *resumed], env=env, capture_output=True, text=True, timeout=300)
