@@ -118,8 +118,12 @@ class Learner:
         return np.repeat(values, [self.scene.agents * self.shared.count(self.size(b)) for b in self.closed_loop])
 
     def losses(self, branch: Branch) -> tuple[str, ...]:
-        """The losses of a branch: those that the scene has, and L_adv where its rollouts are fakes."""
-        has = {"reconstruction": self.scene.reconstructs_rollouts, "adversarial": branch in self.faking}
+        """The losses of a branch: those that the scene has, L_adv where its rollouts are fakes, and recovery of types where it counts."""
+        has = {
+            "reconstruction": self.scene.reconstructs_rollouts,
+            "adversarial": branch in self.faking,
+            "type_recovery": bool(self.weights.type_recovery),
+        }
         return tuple(name for name in branch.losses if has.get(name, True))
 
     @property

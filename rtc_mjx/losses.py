@@ -40,6 +40,8 @@ class LossWeights:
         type_kl: the paper's beta.
         type_kl_ramp: updates over which beta rises linearly from zero.
         type_info: InfoMGAIL's mutual-information term.
+        type_recovery: that RTC's encoder reads off a rollout which type of the prior it was under. Not in the paper; 0 leaves it out.
+        type_recovery_ramp: updates over which that rises linearly from zero.
         type_nll: Symphony's label likelihood under its prior.
         discriminator_penalty: R1 gradient penalty of the discriminator, on the expert's pairs.
         discriminator_penalty_agent: R2, that penalty on the agents' pairs; 0 leaves it out.
@@ -60,6 +62,8 @@ class LossWeights:
     type_kl: float = 0.01
     type_kl_ramp: int = 0
     type_info: float = 0.1
+    type_recovery: float = 0.0
+    type_recovery_ramp: int = 1000
     type_nll: float = 1.0
     discriminator_penalty: float = 0.1
     discriminator_penalty_agent: float = 0.0
@@ -151,6 +155,16 @@ def type_info(agent: Agent, case: Case, weights: LossWeights) -> Array:
     return -jnp.mean(agent.space.inference(outputs).log_prob(case.typed.agent_type))
 
 
+def type_recovery(agent: Agent, case: Case, weights: LossWeights) -> Array:
+    """-log e(g_p | tau_hat): how far the encoder is from telling which type of the prior a rollout was under; policy and encoder lower it.
+
+    Types of the prior know nothing of the episode's luck. An encoder that has to read them off behaviour learns to read what an agent
+    decides, not what happens to it; and the policy is to show its type whatever happens. For types, the sleep phase of Hinton et al.,
+    1995, "The wake-sleep algorithm for unsupervised neural networks", for the policy InfoGAN's term (Chen et al., 2016, eq. 5).
+    """
+    return -agent.posterior(case.rollout).log_prob(lax.stop_gradient(case.typed.agent_type))
+
+
 def type_nll(agent: Agent, case: Case, weights: LossWeights) -> Array:
     """-log p(label): Symphony's prior over its hand-made types, trained by cross-entropy."""
     return -agent.prior(case.demonstration.trajectory.observations[0]).log_prob(case.typed.agent_type)
@@ -164,9 +178,10 @@ LOSSES: dict[str, Loss] = {
     "value": value,
     "type_kl": type_kl,
     "type_info": type_info,
+    "type_recovery": type_recovery,
     "type_nll": type_nll,
 }
-PATHWISE = frozenset({"adversarial", "type_info", "reconstruction"})  # losses that are differentiated through the rollout
+PATHWISE = frozenset({"adversarial", "type_info", "type_recovery", "reconstruction"})  # losses that are differentiated through the rollout
 CLOSED_LOOP = PATHWISE | {"policy_gradient", "value"}  # losses that read the rollout
 
 

@@ -104,7 +104,7 @@ MGAIL = Method((Branch("none", CLONE + PLAY),))
 INFO_MGAIL = Method((Branch("inference", CLONE), Branch("fixed_prior", (*PLAY, "type_info"))), test_types="fixed_prior")
 SYMPHONY = Method((Branch("label", (*CLONE, *PLAY, "type_nll")),), kind="label", test_types="prior")
 NAIVE_HIERARCHY = Method((Branch("encoder", ENCODED),), test_types="prior")
-RTC = Method((Branch("encoder", ENCODED, "encoder_share"), Branch("prior", PLAY, "rest")), test_types="prior")
+RTC = Method((Branch("encoder", ENCODED, "encoder_share"), Branch("prior", (*PLAY, "type_recovery"), "rest")), test_types="prior")
 
 METHODS: Mapping[str, Method] = {
     "bc": BC,

@@ -61,7 +61,8 @@ def plain_rollouts(held, agent, batch, typed, key):
 
 @pytest.mark.parametrize("method", ON_SCENE)
 def test_two_stage_gradient_is_that_of_the_plain_loop(method, x64):
-    held = learner(method, weights=LossWeights(adversarial=0.7, adversarial_ramp=0, type_kl=0.1, discriminator_penalty_agent=0.05))
+    more = {"discriminator_penalty_agent": 0.05, "type_recovery": 0.1, "type_recovery_ramp": 0}
+    held = learner(method, weights=LossWeights(adversarial=0.7, adversarial_ramp=0, type_kl=0.1, **more))
     state, batch = begin(held)
     ours, _ = jax.jit(lambda n: gradients(held, n, batch, random.key(3), jnp.array(0)))(state.networks)
     plain = jax.jit(jax.grad(lambda n: plain_loss(held, n, batch, random.key(3))))(state.networks)
@@ -274,6 +275,26 @@ def test_discriminator_never_sees_the_type(method):
     state, batch = begin(held)
     first = state.networks.discriminator.head.layers[0].kernel
     assert first.shape[0] == batch.trajectory.observations.shape[-1] + batch.trajectory.actions.shape[-1]
+
+
+@pytest.mark.parametrize("method", ENCODING)
+def test_recovery_of_types_is_of_what_the_prior_drew(method):
+    """Policy and encoder lower it, the prior does not; it is of RTC's prior branch, and left out where it weighs nothing."""
+    held = learner(method, weights=only(type_recovery=1.0, type_recovery_ramp=0))
+    state, batch = begin(held)
+    gradient, report = gradients(held, state.networks, batch, random.key(0), jnp.array(0))
+    if not method.startswith("rtc"):
+        assert "type_recovery" not in report and {"losses.type_recovery", "losses.type_recovery_ramp"} <= unread(method)
+        return
+    types, play, *_ = random.split(random.key(0), 4)
+    typed, rollouts = played(held, state.networks, batch, types, play)
+    drawn, first = typed[1].agent_type, held.size(held.method.branches[0]) * (len(held.closed_loop) == 2)
+    tracks = jax.tree.map(lambda x: x[first:], rollouts.tracks)
+    told = jax.vmap(lambda track, g: held.agent(state.networks).posterior(track).log_prob(g))(tracks, drawn)
+    assert report["type_recovery"] == pytest.approx(-float(jnp.mean(told)), rel=1e-5)
+    assert size(gradient.policy) > 0 and size(gradient.encoder) > 0 and size(gradient.prior) == 0
+    without = learner(method)
+    assert "type_recovery" not in gradients(without, state.networks, batch, random.key(0), jnp.array(0))[1]
 
 
 def test_info_mgail_trains_its_inference_on_the_same_term():

@@ -90,7 +90,8 @@ def test_ctrl_c_saves_a_checkpoint_first(tmp_path, monkeypatch):
 
 def test_killed_run_resumes_bit_for_bit(tmp_path):
     """SIGKILL at a moment of its own choosing; what was left behind goes on to the same numbers."""
-    command = [sys.executable, "-m", "rtc_mjx.train", "--method", "bc", *SMALL, "--every.save", "10", "--every.test", "40", "--updates", "120"]
+    often = ["--updates", "120", "--every.test", "40", "--every.save", "10"]
+    command = [sys.executable, "-m", "rtc_mjx.train", "--method", "bc", *SMALL, *often]
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     subprocess.run([*command, "--run", str(tmp_path / "a")], env=env, capture_output=True, check=True, timeout=300)
     with subprocess.Popen([*command, "--run", str(tmp_path / "b")], env=env, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as child:
@@ -536,7 +537,7 @@ def test_a_run_may_lack_later_settings_that_its_method_does_not_read(method, tmp
     held = settings(method)
     config.write(held, tmp_path)
     table = json.loads((tmp_path / "config.json").read_text())
-    for name in (*config.OF_VALUE, "model.posterior_components", "losses.discriminator_penalty_agent", "losses.fakes"):
+    for name in (*config.OF_VALUE, *config.OF_RECOVERY, "model.posterior_components", "losses.discriminator_penalty_agent", "losses.fakes"):
         section, key = name.split(".")
         del table[section][key]
     (tmp_path / "config.json").write_text(json.dumps(table))

@@ -6,10 +6,11 @@ into options (`command_line`: `--losses.adversarial 0.5`). A [methods.NAME] tabl
 
 from rtc_mjx.config.command_line import from_command_line
 from rtc_mjx.config.files import defaults, read, write
-from rtc_mjx.config.options import OF_VALUE, Config, Experts, Intervals, differing, flat, later, to_dict, unread
+from rtc_mjx.config.options import OF_RECOVERY, OF_VALUE, Config, Experts, Intervals, differing, flat, later, to_dict, unread
 from rtc_mjx.config.ranges import check
 
 __all__ = [
+    "OF_RECOVERY",
     "OF_VALUE",
     "Config",
     "Experts",

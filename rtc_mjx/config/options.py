@@ -20,6 +20,7 @@ OF_VALUE = (  # read by methods with a V, and by no other
     *("losses.policy_gradient", "losses.policy_gradient_start", "losses.policy_gradient_ramp", "losses.value"),
     *("optimiser.value_rate", "optimiser.discount", "optimiser.trace"),
 )
+OF_RECOVERY = ("losses.type_recovery", "losses.type_recovery_ramp")  # read by RTC
 
 
 @dataclass(frozen=True)
@@ -142,10 +143,14 @@ def differing(ours: Config, theirs: Config) -> list[tuple[str, Any, Any]]:
 def unread(method: str) -> frozenset[str]:
     """Settings that a method does not read: two runs of it that differ in these are alike."""
     held = METHODS[method_name(method)]
-    one_for_all = held.faking("test") == held.closed_loop
-    return frozenset(() if "value" in held.parts else OF_VALUE) | frozenset(["losses.fakes"] if one_for_all else ())
+    read = {
+        OF_VALUE: "value" in held.parts,
+        OF_RECOVERY: any("type_recovery" in branch.losses for branch in held.branches),
+        ("losses.fakes",): held.faking("test") != held.closed_loop,
+    }
+    return frozenset(name for names, does in read.items() if not does for name in names)
 
 
 def later(method: str) -> frozenset[str]:
     """Settings that a run may lack since they came later: those its method does not read, and those whose default is what was before."""
-    return unread(method) | {"model.posterior_components", "losses.discriminator_penalty_agent", "losses.fakes"}
+    return unread(method) | {"model.posterior_components", "losses.discriminator_penalty_agent", "losses.fakes", *OF_RECOVERY}

@@ -20,6 +20,7 @@ LEAST = {
             "losses.policy_gradient_start",
             "losses.policy_gradient_ramp",
             "losses.type_kl_ramp",
+            "losses.type_recovery_ramp",
             "optimiser.discriminator_steps",
         ),
         0,
