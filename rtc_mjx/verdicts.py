@@ -101,7 +101,10 @@ def null(of: str) -> Quantity:
 
 
 def _told(record: Record) -> Mapping[str, Any]:
-    return record["type_shift"]["information"]["xi"]
+    found = record["type_shift"]["information"]["xi"]
+    if record["type_shift"]["probe"]["control"]["bits"] <= 0:  # of what surely is there
+        raise KeyError("the probe finds nothing, in its control neither: too few demonstrations")
+    return found
 
 
 @dataclass(frozen=True)

@@ -123,8 +123,9 @@ def test_verdicts_need_an_interval_and_enough_seeds():
     assert said([1.0, 1.1, 1.2, 0.9, 1.3, 0.8]) == "yes (6 seeds)"
 
 
-def analysed(held, bits, null):
-    return held | {"type_shift": {"information": {"xi": {"bits": bits, "null_95": null}}}}
+def analysed(held, bits, null, control=0.8):
+    found = {"information": {"xi": {"bits": bits, "null_95": null}}, "probe": {"control": {"bits": control, "at_most": 0.9}}}
+    return held | {"type_shift": found}
 
 
 def test_claims_say_what_was_measured_and_whether_it_holds():
@@ -157,6 +158,19 @@ def test_claims_say_what_was_measured_and_whether_it_holds():
     assert "info_mgail_c was not run" in rows[f"RTC returns at least what InfoMGAIL does {c}"][3]
     assert "31.12" in rows[f"RTC returns at least what MGAIL does {c}"][3] and "section V-A" in rows["MGAIL returns more than BC"][1]
     assert claims.table("roundabout", held) == ""
+
+
+def test_a_probe_that_does_not_find_what_is_there_tests_no_claim():
+    """As on a few dozen demonstrations: there types hold no luck as far as anybody can see."""
+    of = {"return": [1.0] * 4}
+    blind = {
+        name: analysed(record(name, prior=of), [-0.4, -0.5, -0.4, -0.5], -0.1, control=-0.9) for name in ("rtc_c", "naive_hierarchy_c")
+    }
+    row = next(line for line in claims.table("double_goal", blind).splitlines() if "RTC's types hold no luck (continuous types)" in line)
+    assert "in its control neither" in row and "| not tested |" in row
+    seeing = {name: analysed(held, [0.0, 0.1, 0.0, 0.1], 0.2) for name, held in blind.items()}
+    row = next(line for line in claims.table("double_goal", seeing).splitlines() if "RTC's types hold no luck (continuous types)" in line)
+    assert "| yes (4 seeds) |" in row
 
 
 @functools.cache
