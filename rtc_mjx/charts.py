@@ -165,9 +165,10 @@ def overview(held: Held, file: Path) -> None:
         axes.axvline(other[across], color="k", linestyle="-.", linewidth=0.8, label="expert against expert", zorder=1)
     for name, record in held.items():
         how = style(name)
+        points = {**how, "linestyle": ""}
         x, y = (np.array(record["metrics"][metric]["per_seed"]) for metric in (across, up))
-        axes.plot(x, y, how["marker"], color=how["color"], markersize=3, alpha=0.45, zorder=3)
-        axes.plot(x.mean(), y.mean(), **{**how, "linestyle": ""}, markersize=8, label=name, zorder=5)
+        axes.plot(x, y, **points, markersize=3.5, alpha=0.45, zorder=3)
+        axes.plot(x.mean(), y.mean(), **points, markersize=8, label=name, zorder=5)
         if paired := record["types"].get("paired"):
             tail = (paired[across]["mean"], paired[up]["mean"])
             arrow = {"arrowstyle": "->", "color": how["color"], "linestyle": how["linestyle"], "shrinkA": 3, "shrinkB": 5}
