@@ -319,12 +319,13 @@ def test_what_types_carry_and_conditional_realism_have_a_row_for_every_method():
     held = {
         "bc": record("bc", prior={"return": [1.0] * 4}) | {"type_shift": {"realism": shift_of()["realism"]}},
         "mgail": record("mgail", prior={"return": [1.0] * 4}) | {"type_shift": {}},  # as of recordings
-        "rtc_c": record("rtc_c", prior={"return": [1.0] * 4}) | {"type_shift": shift_of()},
+        "rtc_c": record("rtc_c", prior={"return": [1.0] * 4}) | {"type_shift": shift_of() | {"commit": "analysed"}},
     }
     shift, realism = (report.TABLES[name](held, "double_goal").splitlines() for name in ("type_shift", "conditional_realism"))
     assert sum(line.startswith("| rtc_c") for line in shift) == 1 and "| -18 [-18, -18] | -1 [-1, -1] | 2 ± 0 [2, 2] | 0.01 |" in shift[2]
     assert not any(line.startswith("| bc") for line in shift)
     assert [line.split(" | ")[2].strip(" |") for line in realism if line.startswith(("| bc", "| rtc_c"))] == ["0.05", "0.05"]
+    assert "Commit analysed." in shift[-1] and "analysed (rtc_c)" in realism[-1]  # of the analysis, not of the evaluation before it
 
 
 def test_the_figure_of_type_shift_has_every_seed_under_every_source_of_types(tmp_path, monkeypatch):
